@@ -17,7 +17,7 @@ from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.motion import Motions, motions_of
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import is_waveform
+from sprung.model.diagnosis.response.terms import evaluated_in_time
 from sprung.model.laws import SensorLaw
 from sprung.model.signals import FloatArray
 
@@ -143,7 +143,7 @@ def _add_terms(
 ) -> None:
     """Columns of the terms' parameters, laws' answers left out."""
     at = P = len(point.theta)
-    measured = forward.driven_by(problem.part)
+    measured = forward.with_part(problem.part)
     for index, term in enumerate(point.terms):
         for j in range(len(term.parameters)):
             if forward.faulty_force(term) is not None:
@@ -152,7 +152,7 @@ def _add_terms(
                 if problem.process_noise:
                     change = forward.inputs_by_force_fault(term)[forward.part.grid.band]
                     known.log_det[at] = working.whitener.log_det_slope(change)
-            elif forces is not None and is_waveform(term):
+            elif forces is not None and evaluated_in_time(term):
                 port, change = law_change(forward, forces, term, j)
                 known.law_forces[:, at - P, port] = change
                 known.packed.add_port(at, forces.ports[port], change)

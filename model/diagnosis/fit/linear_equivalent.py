@@ -17,19 +17,19 @@ from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces
 from sprung.model.diagnosis.response.motion import particular_start
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.signals import FloatArray
 
 _ROUNDS = 4  # of equivalent law and motion
 _SETTLED = 1e-3  # largest change of an equivalent stiffness or damping, as a share of it and the element's
 _ROUGH = 1e-3  # of the laws' forces, along which an equivalent is read
-_NEAR = 0.2  # the same where the loop converges anyway
+_NEAR = 0.2  # the same where the balance converges anyway
 
 
 def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | None) -> Point:
     """The point with the laws' equivalent stiffness and damping moved into the plant.
 
-    The equivalent depends on the motion that the law shapes, so the two are iterated until the loop converges; a
+    The equivalent depends on the motion that the law shapes, so the two are iterated until the balance converges; a
     motion that follows the sensors stays as it is.
     """
     if not any(_carried(term) for term in point.terms):
@@ -46,9 +46,9 @@ def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | No
             break
         # the free state counts from the plant's particular solution, which has changed: keep motion and true state
         moved = problem.forward(point, inputs)
-        loop = moved.loop(point.state)
-        if loop is not None:
-            point = replace(point, state=start + point.state - particular_start(moved, loop.answer(force)))
+        balance = moved.harmonic_balance(point.state)
+        if balance is not None:
+            point = replace(point, state=start + point.state - particular_start(moved, balance.solution(force)))
         if forces.converged and change < _NEAR:
             break
     return point
@@ -56,7 +56,7 @@ def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | No
 
 def _carried(term: Term) -> bool:
     """Whether the plant can carry a law's equivalent: that of a pair couples two elements, which no element does."""
-    return is_waveform(term) and "|" not in term.location
+    return evaluated_in_time(term) and "|" not in term.location
 
 
 def _moved(forward: Forward, forces: LawForces, point: Point) -> tuple[tuple[Term, ...], FloatArray, float]:

@@ -27,7 +27,7 @@ from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.motion import Motions
-from sprung.model.diagnosis.response.point import Point, advance, held_back
+from sprung.model.diagnosis.response.point import Point, advance, at_active_bounds
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
@@ -152,7 +152,7 @@ def optimise(
     others = (
         iterations,
         tolerance,
-        problem.patient,
+        problem.newton_allowed,
         problem.rules.fit.prior,
         None if whitener is None else whitener.factor,
     )
@@ -233,15 +233,15 @@ def _begun_anew(problem: Problem, state: _State) -> _State:
 
 
 def _value(problem: Problem, residual: FloatArray, log_det: float, point: Point) -> float:
-    return float(residual @ residual + log_det + np.sum(_strayed(problem, point)[0] ** 2))
+    return float(residual @ residual + log_det + np.sum(_prior_residual(problem, point)[0] ** 2))
 
 
-def _strayed(problem: Problem, point: Point) -> tuple[FloatArray, FloatArray]:
+def _prior_residual(problem: Problem, point: Point) -> tuple[FloatArray, FloatArray]:
     """Distance of theta and the terms' parameters from what is expected, in deviations, and one over these."""
     prior = problem.rules.fit.prior
     away, sharp = [point.theta / prior], [np.full(len(point.theta), 1 / prior)]
     for term in point.terms:
-        away.append(term.strayed)
+        away.append(term.prior_deviations)
         sharp.append(1 / np.array(term.known) if term.known else np.zeros(len(term.parameters)))
     return np.concatenate(away), np.concatenate(sharp)
 
@@ -251,7 +251,7 @@ def _value_under(problem: Problem, state: _State, working: Working) -> float:
     inputs, point = working.inputs, state.point
     if inputs is None:
         return state.value
-    forward = state.lin.forward.driven_by(inputs.part, point.warm_start)
+    forward = state.lin.forward.with_part(inputs.part, point.warm_start)
     shown = problem.shown(forward, law_forces(forward, point, inputs))
     free = problem.free_columns(forward) @ point.state
     residual = working.whitener(problem.part.sensors - shown - free, problem.part)
@@ -264,7 +264,7 @@ def information(problem: Problem, fit: Fit) -> FloatArray:
 
 
 def _with_expected(problem: Problem, point: Point, gram: FloatArray) -> FloatArray:
-    sharp = _strayed(problem, point)[1]
+    sharp = _prior_residual(problem, point)[1]
     normal = gram.copy()
     normal[np.arange(len(sharp)), np.arange(len(sharp))] += sharp**2
     return normal
@@ -282,10 +282,10 @@ def _step(problem: Problem, lin: Linearised, point: Point, damping: float) -> tu
     scaled, scale = _normal(problem, lin, point)
     gradient = lin.jacobian.T @ lin.residual
     gradient[: len(lin.log_det_slope)] -= lin.log_det_slope / 2
-    away, sharp = _strayed(problem, point)
+    away, sharp = _prior_residual(problem, point)
     gradient[: len(sharp)] -= away * sharp
     step, variance, promised = _solved(scaled, scale, gradient, damping)
-    held = held_back(point, step)
+    held = at_active_bounds(point, step)
     if held.any():  # the others go on as if it were given
         scaled[held], scaled[:, held], gradient[held] = 0.0, 0.0, 0.0
         step, variance, promised = _solved(scaled, scale, gradient, damping)

@@ -45,7 +45,7 @@ class Problem:
     rules: Rules = RULES  # by which fits to it are judged
     memory: FitMemory | None = None  # fits that are known already
     work: WorkBudget | None = None  # what fits may cost; None: any
-    patient: bool = True  # whether loops of laws and motion are solved however long that takes
+    newton_allowed: bool = True  # whether loops of laws and motion are solved however long that takes
 
     @property
     def process_noise(self) -> bool:
@@ -63,7 +63,9 @@ class Problem:
         known: the plant of a model nearby, often the same.
         """
         part = self.part if inputs is None else inputs.part
-        return Forward(self.system, part, self.sensors, point.theta, point.terms, point.warm_start, known, self.patient)
+        return Forward(
+            self.system, part, self.sensors, point.theta, point.terms, point.warm_start, known, self.newton_allowed
+        )
 
     def predict(
         self, point: Point, inputs: SmoothedInputs | None = None, known: Plant | None = None
@@ -72,7 +74,7 @@ class Problem:
         forward = self.forward(point, inputs, known)
         forces = law_forces(forward, point, inputs)
         if self.work is not None and forces is not None:
-            self.work.add(_ROUND * forces.rounds * self.part.grid.samples)
+            self.work.add(_ROUND * forces.evaluations * self.part.grid.samples)
         return self.shown(forward, forces), forward, forces
 
     def shown(self, forward: Forward, forces: LawForces | None) -> ComplexArray:
@@ -113,5 +115,5 @@ def law_forces(
     """Forces of the laws: along the smoothed motion where they are known there, else of a free run."""
     if inputs is None or inputs.force is None:
         return forward.law_forces(point.state, tolerance)
-    loop = forward.loop(point.state)
-    return None if loop is None else loop.answer(inputs.force)
+    balance = forward.harmonic_balance(point.state)
+    return None if balance is None else balance.solution(inputs.force)

@@ -71,19 +71,23 @@ def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Workin
         state = of_residual @ whitener(spectrum, part)
         return state, _smoothed(part, whitener, spectrum - free @ state)
 
-    loop = forward.loop(point.state)
-    if loop is None:
+    balance = forward.harmonic_balance(point.state)
+    if balance is None:
         state, inputs = explained(None)
         return replace(point, state=state), Working(whitener, SmoothedInputs(inputs), forward.plant)
 
-    def along(force: FloatArray, loop: HarmonicBalance = loop) -> FloatArray:
-        state, inputs = explained(loop.answer(force))
-        driven = loop.driven(forward.driven_by(inputs).fine_motion(loop.ports, state))
-        return driven.law(*driven.motion(force))
+    def along(force: FloatArray, balance: HarmonicBalance = balance) -> FloatArray:
+        state, inputs = explained(balance.solution(force))
+        driven = balance.under(forward.with_part(inputs).fine_motion(balance.ports, state))
+        return driven.law_forces(*driven.motion(force))
 
-    start = np.column_stack(point.warm_start) if point.warm_start else along(np.zeros((len(loop.d0), len(loop.terms))))
+    start = (
+        np.column_stack(point.warm_start)
+        if point.warm_start
+        else along(np.zeros((len(balance.d0), len(balance.terms))))
+    )
     force, _ = fixed_point(along, start, _FOLLOWED)
-    state, inputs = explained(loop.answer(force))
+    state, inputs = explained(balance.solution(force))
     working = Working(whitener, SmoothedInputs(inputs, force), forward.plant)
     return replace(point, state=state, warm_start=tuple(force.T)), working
 

@@ -1,4 +1,4 @@
-"""How laws along the trajectory answer small changes of it: sensitivities through the loop of laws and plant."""
+"""How laws along the trajectory answer small changes of it: sensitivities through the balance of laws and plant."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def port_motions(
     """
     plant, grid = forward.plant, forward.part.grid
     structure = plant.structure
-    ports = forward.plant.structure.widened(forces.ports)
+    ports = forward.plant.structure.padded(forces.ports)
     P, p = theta_forces.shape[1], law_forces.shape[1]
     spectra = np.zeros((len(grid.omega), len(ports), P + p), dtype=complex)
     of_force = plant.compliance(ports, np.eye(len(structure.H)))  # (F, m, E)
@@ -123,7 +123,7 @@ def tangent(
     """
     plant, grid = forward.plant, forward.part.grid
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
-    ports = forward.plant.structure.widened(forces.ports)
+    ports = forward.plant.structure.padded(forces.ports)
     compliance = plant.compliance(ports, ports)
     if correction is not None:
         compliance[grid.band] -= correction.deflection @ correction.seen
@@ -221,7 +221,7 @@ class SmootherCorrection:
     def __init__(self, whitener: Whitener, forward: Forward, forces: LawForces) -> None:
         plant, self.grid = forward.plant, forward.part.grid
         band = self.grid.band
-        ports = forward.plant.structure.widened(forces.ports)
+        ports = forward.plant.structure.padded(forces.ports)
         inputs = plant.deflection_of_inputs[band]
         self.deflection = ports @ inputs @ whitener.smoother_gain  # of whitened sensor signals, (F, m, S)
         self.rate = 1j * self.grid.omega[band, None, None] * self.deflection

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 class WorkBudget:
     """Samples of all models that were linearised, and how many may be.
 
-    Solving a law's loop counts as a share of that for every time the law is asked for its force over the record.
+    Solving a law's balance counts as a share of that for every time the law is asked for its force over the record.
     """
 
     def __init__(self, most: float, until: float = math.inf) -> None:
@@ -23,7 +23,7 @@ class WorkBudget:
         self.done = 0.0
 
     def add(self, samples: float) -> None:
-        """One more linearisation, or as much of one as a loop takes."""
+        """One more linearisation, or as much of one as a balance takes."""
         self.done += samples
 
     @property

@@ -17,7 +17,7 @@ from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.point import Point, advance
-from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.rules import FormulaRules
 from sprung.model.diagnosis.screening.elements import TrialElement
 from sprung.model.diagnosis.screening.families import ELEMENT
@@ -66,7 +66,7 @@ def without_last_term(problem: Problem, fit: Fit) -> Fit:
     residual = fit.residual + projector.seen_of(term.port(problem.system), spectrum)
     own = np.zeros(fit.jacobian.shape[1], dtype=bool)
     own[fit.place(len(point.terms) - 1)] = True
-    near = point.warm_start[: sum(is_waveform(other) for other in point.terms[:-1])]
+    near = point.warm_start[: sum(evaluated_in_time(other) for other in point.terms[:-1])]
     return replace(
         fit,
         point=replace(point, terms=point.terms[:-1], warm_start=near),

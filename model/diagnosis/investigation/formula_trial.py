@@ -7,7 +7,7 @@ import numpy as np
 from sprung.model.diagnosis.investigation.formula import excess_chi_square, formula_of
 from sprung.model.diagnosis.investigation.formula_doubt import missing
 from sprung.model.diagnosis.investigation.state import Investigation
-from sprung.model.diagnosis.response.terms import is_waveform
+from sprung.model.diagnosis.response.terms import evaluated_in_time
 from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.diagnosis.selection.evidence import chance
 
@@ -52,7 +52,7 @@ def _force_to_express(state: Investigation, plain: list[Trial]) -> Trial | None:
     leader, rules = plain[0], state.options.rules.formula
     if not leader.named:
         return leader
-    forces = [one for one in plain if is_waveform(one.term) and one.term.location in state.system.elements]
+    forces = [one for one in plain if evaluated_in_time(one.term) and one.term.location in state.system.elements]
     own = any(leader is one for one in forces)
     if excess_chi_square(state.problem, leader.fit) > rules.leaves * excess_chi_square(state.problem, state.fit):
         best = next(iter(forces), None)  # unless the residual belongs to another place

@@ -10,7 +10,7 @@ from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import cost
 from sprung.model.diagnosis.selection.evidence import process_gain, profile_gain
@@ -58,7 +58,7 @@ def _gain(other: Investigation, state: Investigation) -> float:
 def _without(state: Investigation, index: int) -> Fit | None:
     """The model without one of its terms, fitted again with the same weights; None where that diverges."""
     point, forces = state.fit.point, list(state.fit.point.warm_start)
-    warm = [forces.pop(0) if is_waveform(term) and forces else None for term in point.terms]
+    warm = [forces.pop(0) if evaluated_in_time(term) and forces else None for term in point.terms]
     terms = (*point.terms[:index], *point.terms[index + 1 :])
     start = tuple(force for i, force in enumerate(warm) if i != index and force is not None)
     bare = Point(point.theta, terms, np.zeros(0), start)

@@ -21,7 +21,7 @@ from sprung.model.diagnosis.investigation.judgement import leaves_more_than_nois
 from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covariance
 from sprung.model.diagnosis.investigation.redundant import without
 from sprung.model.diagnosis.investigation.state import Investigation
-from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.selection.plausible import hardly_there
 from sprung.model.signals import FloatArray
 
@@ -50,7 +50,9 @@ def shared_gain_covariance(state: Investigation) -> FloatArray:
     """Covariance of parameters and laws from the uncertainty of the gain common to all channels, (P + p, P + p)."""
     fit, (_, spread) = state.fit, shared_gain(_instruments(state))
     nothing = np.zeros_like(fit.covariance)
-    if not state.calibrations or not any(is_waveform(term) for term in fit.point.terms):  # the fit contains it already
+    if not state.calibrations or not any(
+        evaluated_in_time(term) for term in fit.point.terms
+    ):  # the fit contains it already
         return nothing
     other = _scaled(state, 1 + spread)
     if other is None or not np.all(np.isfinite(other.point.theta)):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.state import Investigation
-from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.laws import ElementLaw, Motion
@@ -54,7 +54,7 @@ def _of_element(state: Investigation, term: Term, key: str) -> dict[str, NDArray
     d, v = (d_all @ port)[::4], (v_all @ port)[::4]
     thin = slice(None, None, max(1, len(d) // _MOST))
     time = grid.start + grid.time
-    if is_waveform(term):
+    if evaluated_in_time(term):
         law = force_along(term.element_law, term.parameters, d, v, time, fit.forward.element_of(term))
     else:
         law = np.zeros_like(d)

@@ -1,6 +1,6 @@
-"""What the sensors should show: nominal structure with any terms in place, driven by the measured inputs.
+"""The forward model: sensor signals of the nominal structure with terms, driven by the measured inputs.
 
-The linear part is mapped bin by bin; the forces of laws along the trajectory are found in `loop`.
+The linear part is mapped bin by bin, the forces of laws along the trajectory are found by harmonic balance.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.newton import PATIENCE, newton_step
 from sprung.model.diagnosis.response.structure import Structure
-from sprung.model.diagnosis.response.terms import Term, branches_of, is_waveform, supports
+from sprung.model.diagnosis.response.terms import Term, branches_of, evaluated_in_time, supports
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, StructureLaw, SupportLaw
 from sprung.model.laws.structure import sites_of
 from sprung.model.mechanics import VELOCITY
@@ -27,7 +27,7 @@ from sprung.model.system import System
 
 
 def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Structure:
-    """Structure for log-ratios `theta` (P,) of the system's parameters, laws of bodies and structure in place."""
+    """Structure for log-ratios `theta` (P,) of the system's parameters, with laws of bodies and structure."""
     mechanics = system.mechanics
     for term in terms:
         if isinstance(term.law, BodyLaw) and term.law.load is None:
@@ -51,23 +51,23 @@ def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: 
 
 @dataclass(frozen=True)
 class Forward:
-    """One model on one part of the recording."""
+    """One model on one part of a recording."""
 
     system: System
     part: Part
     sensors: np.ndarray  # indices of the present sensors, (S,)
     theta: FloatArray  # (P,)
     terms: tuple[Term, ...] = ()
-    start_force: tuple[FloatArray, ...] = ()  # forces of a nearby solution, to start the iteration from
-    known: Plant | None = None  # of a model nearby, taken where its structure is the same
-    patient: bool = True  # whether loops that do not settle are solved by Newton's steps
+    warm_start: tuple[FloatArray, ...] = ()  # laws' forces of a nearby solution, each (4N,)
+    known: Plant | None = None  # of a nearby model, reused if the structure is equal
+    newton_allowed: bool = True  # whether Newton's method is tried where the balance does not converge
 
     @cached_property
     def plant(self) -> Plant:
         structure = structure_of(self.system, self.sensors, self.theta, self.terms)
         structure = replace(structure, sensor_kind=np.where(self.part.differentiated, VELOCITY, structure.sensor_kind))
         stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
-        for term in filter(is_waveform, self.terms):
+        for term in filter(evaluated_in_time, self.terms):
             if "|" not in term.location:
                 e = self.system.elements.index(term.location)
                 stiffness[e] += term.equivalent[0]
@@ -79,11 +79,11 @@ class Forward:
         return Plant(structure, self.part.grid)
 
     def element_of(self, term: Term) -> SpringDamper:
-        """Spring and damper that a law belongs to, at the present parameters."""
+        """Spring and damper of the element a term acts at, with the parameters of this model."""
         return self.element_at(term.location)
 
     def element_at(self, location: str) -> SpringDamper:
-        """Spring and damper of an element, or of the first of a pair, at the present parameters."""
+        """Spring and damper of an element, or of the first of a pair, with the parameters of this model."""
         structure = structure_of(self.system, self.sensors, self.theta)
         e = self.system.elements.index(location.partition("|")[0])
         return SpringDamper(structure.stiffness[e], structure.damping[e])
@@ -110,7 +110,7 @@ class Forward:
 
     @cached_property
     def _unmeasured(self) -> tuple[ComplexArray, FloatArray]:
-        """What the supports move besides what is measured: (F, supports) and (DEGREE + 1, supports)."""
+        """Motion of the supports beside the measured one: (F, supports) and (DEGREE + 1, supports)."""
         grid = self.part.grid
         spectrum = np.zeros(self.part.support.shape, dtype=complex)
         polynomial = np.zeros(self.part.support_polynomial.shape)
@@ -127,7 +127,7 @@ class Forward:
 
     @cached_property
     def support(self) -> ComplexArray:
-        """Displacement of the supports, periodic part, (F, supports)."""
+        """Displacement of the supports, m, periodic part, (F, supports)."""
         return self.part.support / self.support_gain + self._unmeasured[0]
 
     @property
@@ -160,12 +160,12 @@ class Forward:
         return gain, offset
 
     def faulty_force(self, term: Term) -> int | None:
-        """Which measured force a term finds at fault."""
+        """Index of the measured force that a term is a fault of; None for other terms."""
         names = [n for n, source in self.system.file.inputs.items() if source.kind == "force"]
         return names.index(term.location) if isinstance(term.law, SensorLaw) and term.location in names else None
 
     def fault_load(self, term: Term) -> ComplexArray:
-        """Load on the degrees of freedom per rise of the first parameter of a measured force's fault, (F, n)."""
+        """Derivative of the load on the degrees of freedom by the first parameter of a force's fault, (F, n)."""
         i, law = self.faulty_force(term), term.law
         if i is None or not isinstance(law, SensorLaw):
             raise TypeError(f"{law.name} at {term.location} is no fault of a measured force")
@@ -176,7 +176,7 @@ class Forward:
         return found
 
     def inputs_by_force_fault(self, term: Term) -> ComplexArray:
-        """Change of `of_inputs` with the first parameter of a measured force's fault, (F, S, inputs)."""
+        """Derivative of `of_inputs` by the first parameter of a force's fault, (F, S, inputs)."""
         i, law = self.faulty_force(term), term.law
         if i is None or not isinstance(law, SensorLaw):
             raise TypeError(f"{law.name} at {term.location} is no fault of a measured force")
@@ -187,14 +187,14 @@ class Forward:
 
     @property
     def of_inputs(self) -> ComplexArray:
-        """What the sensors show of measured supports and forces, (F, S, inputs)."""
+        """Shown sensor signals per measured support motion and force, (F, S, inputs)."""
         both = np.concatenate([self.plant.sensor_of_support, self.plant.sensor_of_measured_force], axis=2)
         gains = np.concatenate([self.support_gain, self.force_faults[0]])
         found: ComplexArray = both * self.sensor_factor[:, :, None] / gains
         return found
 
     def inputs_by_mass(self, dofs: np.ndarray) -> ComplexArray:
-        """Change of `of_inputs` with the log of the mass at degrees of freedom (n,), (F, S, inputs)."""
+        """Derivative of `of_inputs` by the log of the mass at degrees of freedom (n,), (F, S, inputs)."""
         plant, s = self.plant, self.plant.structure
         moved = plant.receptance @ plant.load_of_inputs
         inertia = (self.part.grid.omega**2)[:, None, None] * (s.mass * dofs)[:, None]
@@ -203,7 +203,7 @@ class Forward:
 
     @property
     def force(self) -> ComplexArray:
-        """Measured forces with their faults taken out, periodic part, (F, forces)."""
+        """Measured forces corrected for their faults, periodic part, (F, forces)."""
         return self.part.force / self.force_faults[0]
 
     @property
@@ -215,7 +215,7 @@ class Forward:
         return result / gain
 
     def shown(self, periodic: ComplexArray, polynomial: FloatArray) -> ComplexArray:
-        """What the sensors show of true signals (F, S) + polynomial (DEGREE + 1, S), faults in place."""
+        """Shown signals (F, S) of true ones, periodic (F, S) plus polynomial (DEGREE + 1, S), with sensor faults."""
         grid = self.part.grid
         gain, lag, delay, offset = self.faults
         late = _lagged(_later(polynomial, delay / grid.length), lag / grid.length)
@@ -241,18 +241,18 @@ class Forward:
 
     @cached_property
     def sensor_factor(self) -> ComplexArray:
-        """Shown over true signal of every sensor, (F, S)."""
+        """Frequency response of every sensor, shown over true signal, (F, S)."""
         gain, lag, delay, _ = self.faults
         s = 1j * self.part.grid.omega[:, None]
         found: ComplexArray = gain * np.exp(-s * delay) / (1 + s * lag)
         return found
 
     def of_body_loads(self) -> ComplexArray | float:
-        """Sensor signals of the forces on bodies that nobody measured, (F, S)."""
+        """Sensor signals of the unmeasured forces on bodies, (F, S)."""
         return sum((self.of_body_load(term) for term in self.terms if _loads(term)), 0.0)
 
     def of_body_load(self, term: Term) -> ComplexArray:
-        """Sensor signals of one of them, (F, S)."""
+        """Sensor signals of one unmeasured force on a body, (F, S)."""
         grid, law = self.part.grid, term.law
         assert isinstance(law, BodyLaw) and law.load is not None
         spectrum = grid.forward(law.load(grid.start + grid.time + CLOCK_LEAD, term.parameters))
@@ -273,12 +273,12 @@ class Forward:
         return self.linear_motion @ s.H.T + self.support @ s.G.T
 
     def free_rows(self) -> FloatArray:
-        """Sensors over the free state at the first sample, (N, S, 2n)."""
+        """Shown signals of the free motion per state at the first sample, (N, S, 2n)."""
         grid = self.part.grid
         return self.plant.free_motion(self.free_rows_at_start(), grid.step, grid.samples)
 
     def free_rows_at_start(self) -> FloatArray:
-        """What the sensors show of the state at the first sample, (S, 2n)."""
+        """Output rows of the sensors at the first sample, with their faults, (S, 2n)."""
         rows = self.plant.structure.sensor_rows()
         gain, lag, delay, _ = self.faults
         A = self.plant.structure.state_matrix()
@@ -287,9 +287,9 @@ class Forward:
         return rows * gain[:, None]
 
     def fine_motion(self, ports: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Deflection and rate along ports (m, E) on the oversampled axis, laws' forces left out: 2 x (4N, m)."""
+        """Deflection and rate along ports (m, E) without laws' forces on the oversampled axis, each (4N, m)."""
         plant, grid = self.plant, self.part.grid
-        ports = plant.structure.widened(ports)
+        ports = plant.structure.padded(ports)
         spectrum = self.linear_deflection @ ports.T
         d, v = np.split(grid.fine(np.hstack([spectrum, 1j * grid.omega[:, None] * spectrum])), 2, axis=1)
         polynomial = self.polynomial[1] @ ports.T
@@ -300,39 +300,39 @@ class Forward:
         return d + free[:, : len(ports)], v + free[:, len(ports) :]
 
     def law_forces(self, state: FloatArray, tolerance: float = TOLERANCE) -> LawForces | None:
-        """Forces of the laws along their own trajectory, to a share of themselves; None when no law needs it."""
-        loop = self.loop(state)
-        if loop is None:
+        """Forces of the laws along their own trajectory, to a relative tolerance; None if there are no such laws."""
+        balance = self.harmonic_balance(state)
+        if balance is None:
             return None
-        start = np.column_stack(self.start_force) if self.start_force else loop.law(loop.d0, loop.v0)
-        force, settled = fixed_point(lambda force: loop.law(*loop.motion(force)), start, tolerance)
-        newton = None if settled or not self.patient or self.plant.floats else newton_step(loop)
+        start = np.column_stack(self.warm_start) if self.warm_start else balance.law_forces(balance.d0, balance.v0)
+        force, settled = fixed_point(lambda force: balance.law_forces(*balance.motion(force)), start, tolerance)
+        newton = None if settled or not self.newton_allowed or self.plant.floats else newton_step(balance)
         if newton is None:
-            return loop.answer(force, settled)
-        for begin in (start,) if self.start_force else (start, np.zeros_like(start)):
+            return balance.solution(force, settled)
+        for begin in (start,) if self.warm_start else (start, np.zeros_like(start)):
             found, settled = fixed_point(newton, begin, tolerance, PATIENCE)
             if settled:
-                return loop.answer(found)
-        return loop.answer(force, converged=False)
+                return balance.solution(found)
+        return balance.solution(force, converged=False)
 
-    def loop(self, state: FloatArray) -> HarmonicBalance | None:
-        """The laws that act along the trajectory and the plant between them; None when there is none."""
-        waveform = [term for term in self.terms if is_waveform(term)]
+    def harmonic_balance(self, state: FloatArray) -> HarmonicBalance | None:
+        """Harmonic balance of the laws that are evaluated in time; None if there are none."""
+        waveform = [term for term in self.terms if evaluated_in_time(term)]
         if not waveform:
             return None
         ports = np.array([term.port(self.system) for term in waveform])
         elements = [self.element_of(term) for term in waveform]
         return HarmonicBalance(self.plant, waveform, ports, elements, self.fine_motion(ports, state))
 
-    def driven_by(self, part: Part, start_force: tuple[FloatArray, ...] = ()) -> Forward:
-        """The same model under other inputs; `start_force`: its laws' forces nearby."""
-        other = replace(self, part=part, start_force=start_force)
+    def with_part(self, part: Part, warm_start: tuple[FloatArray, ...] = ()) -> Forward:
+        """The same model under other inputs; warm_start: laws' forces of a nearby solution."""
+        other = replace(self, part=part, warm_start=warm_start)
         other.__dict__["plant"] = self.plant
         return other
 
 
 def response_of(term: Term) -> SensorResponse | None:
-    """What a faulty channel shows of the truth; None for other laws."""
+    """Response of a faulty channel; None for terms that are not faults of a sensor."""
     law = term.law
     if not isinstance(law, SensorLaw) or law.response is None:
         return None

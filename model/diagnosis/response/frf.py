@@ -19,20 +19,20 @@ from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, rigid_body_modes
 from sprung.model.signals import FloatArray
 
-_ON_A_BIN = 1e-9  # distance of an undamped mode's e^{l dt} from a bin's
-_DEFECTIVE = 1e9  # condition of the modes from which they are too close to each other
+_ON_A_BIN = 1e-9  # distance of an undamped mode from a bin on the unit circle
+_DEFECTIVE = 1e9  # condition number of the modes beyond which they count as defective
 
 
 @dataclass(frozen=True)
 class Plant:
-    """A structure on a grid."""
+    """Frequency responses of a structure on a grid."""
 
     structure: Structure
     grid: Grid
 
     @cached_property
     def impedance(self) -> ComplexArray:
-        """k + j w c of each element and what its branches add, N/m, shape (F, E)."""
+        """Dynamic stiffness of each element with its branches, k + j w c + ..., N/m, (F, E)."""
         s = self.structure
         result: ComplexArray = s.stiffness + 1j * self.grid.omega[:, None] * s.damping
         for branch in s.branches:
@@ -47,13 +47,13 @@ class Plant:
         outer = (s.H[:, :, None] * s.H[:, None, :]).reshape(len(s.H), n * n)
         Z = (self.impedance @ outer).reshape(len(w), n, n)
         index = np.arange(n)
-        Z[:, index, index] += s.own_stiffness + 1j * w[:, None] * s.own_damping - w[:, None] ** 2 * s.mass
+        Z[:, index, index] += s.modal_stiffness + 1j * w[:, None] * s.modal_damping - w[:, None] ** 2 * s.mass
         found: ComplexArray = Z
         return found
 
     @cached_property
     def receptance(self) -> ComplexArray:
-        """Displacement per load, m/N, shape (F, n, n); zero at zero frequency where the system floats."""
+        """Displacement per load, m/N, shape (F, n, n); zero at zero frequency where the system is unconstrained."""
         Z = self.dynamic_stiffness
         if np.linalg.cond(Z[0].real) > 1e12:
             result = np.zeros_like(Z)
@@ -63,11 +63,11 @@ class Plant:
 
     @property
     def floats(self) -> bool:
-        """Whether a steady force moves the system away without end: no stiffness holds it."""
+        """Whether the system is unconstrained: it has rigid-body modes without stiffness."""
         return not np.any(self.receptance[0])
 
     def line_motion(self, port: FloatArray) -> FloatArray:
-        """Polynomial motions under a constant unit force along a port and under one that rises to 1.
+        """Polynomial responses to a constant unit force along a port and to a linear one that rises to 1.
 
         (2, DEGREE + 1, n)
         """
@@ -77,7 +77,7 @@ class Plant:
         return np.array([self.polynomial_response(one) for one in load])
 
     def without_line(self, spectrum: ComplexArray) -> tuple[ComplexArray, FloatArray]:
-        """A force's spectrum (F, m) without the line that joins its ends and its mean, and their sizes (2, m)."""
+        """A force's spectrum (F, m) without its mean and the line through its ends, and their sizes (2, m)."""
         series = self.grid.inverse(spectrum)
         slope = 2 * series[-1] - series[-2] - series[0]
         mean = (series - self.grid.monomials[:, 1:2] * slope).mean(axis=0)
@@ -113,7 +113,7 @@ class Plant:
 
     @cached_property
     def steady_rate(self) -> FloatArray:
-        """Velocity under a steady unit load, of what no stiffness holds and a damper brakes, (n, n)."""
+        """Velocity of damped rigid-body modes under a steady unit load, (n, n)."""
         s = self.structure
         loose = rigid_body_modes(s.K)
         return loose @ np.linalg.pinv(loose.T @ s.C @ loose, rcond=1e-9) @ loose.T
@@ -151,7 +151,7 @@ class Plant:
         return found
 
     def sensors_once(self, support: ComplexArray, force: ComplexArray) -> ComplexArray:
-        """The same of a grid without zero frequency, by one solution: for a plant that is asked nothing else."""
+        """As `sensors`, on a grid without zero frequency, by one solution: cheaper if nothing else is needed."""
         s = self.structure
         motion = np.linalg.solve(self.dynamic_stiffness, self.load(support, force)[:, :, None])
         result = (self.sensor_of_dof @ motion)[:, :, 0]
@@ -203,7 +203,7 @@ class Plant:
 
     @cached_property
     def _polynomial_answers(self) -> FloatArray:
-        """Coefficients of motion per coefficient of load, both flattened, of least size where many would do."""
+        """Coefficients of motion per coefficient of load, both flattened; the least-norm solution where not unique."""
         s, T = self.structure, self.grid.length
         p = DEGREE + 1
         first = np.diag(np.arange(1, p), 1) / T  # coefficients of the derivative
@@ -233,7 +233,7 @@ class Plant:
     def _free_modes(self) -> tuple[ComplexArray, ComplexArray, ComplexArray] | None:
         """Modes of the free motion (2n, 2n), transforms of their decays (F, 2n), and the modes' inverse.
 
-        sum_k l^k z^-k = (1 - l^N) / (1 - l / z); None where the modes are too close to each other for that.
+        sum_k l^k z^-k = (1 - l^N) / (1 - l / z); None for defective modes.
         """
         grid = self.grid
         values, vectors = np.linalg.eig(self.structure.state_matrix())

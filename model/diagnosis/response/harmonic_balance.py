@@ -1,10 +1,10 @@
-"""Laws and the motion along their ports: forces that depend on the motion that they shape.
+"""Harmonic balance of laws and plant: restoring forces that depend on the motion they act on.
 
     d = d_linear + D f,   f = law(d, d')        over the whole record at once
 
-Harmonic balance by alternating frequency and time (Cameron and Griffin 1989): the plant answers in frequency, the laws
-in time on an oversampled grid, to a fixed point with Anderson acceleration (Walker and Ni 2011), around the laws'
-equivalent linearisation (`Term.equivalent`, carried by the plant), so that only the law's curvature is left to it.
+Alternating frequency/time method (Cameron and Griffin 1989): the plant is evaluated in the frequency domain, the laws
+in the time domain on an oversampled grid.  The fixed point is found with Anderson acceleration (Walker and Ni 2011).
+The laws' equivalent linearisation (`Term.equivalent`) is part of the plant, so that only their curvature is iterated.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
-TOLERANCE = 1e-6  # of the law's force
+TOLERANCE = 1e-6  # relative, of the laws' forces
 _ITERATIONS = 60
-_PATIENCE, _PROGRESS = 16, 0.5  # it is given up when the error has not fallen by this factor in so many iterations
+_PATIENCE, _PROGRESS = 16, 0.5  # abandoned if the error has not fallen by this factor in as many iterations
 _HISTORY = 8
-_REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate that diverges
+_REACH = 4.0  # times the linear response's amplitude, to which diverging iterates are clipped
 
 
 @dataclass(frozen=True)
 class LawForces:
-    """Solution of the loop for m laws; forces without the equivalents that the plant carries."""
+    """Converged harmonic balance of m laws; forces are less the equivalents, which are part of the plant."""
 
     terms: list[Term]
     ports: FloatArray  # (m, E)
@@ -40,27 +40,27 @@ class LawForces:
     rate: FloatArray  # (4N, m)
     force: FloatArray  # (4N, m)
     converged: bool
-    sensors: ComplexArray  # what the forces add to the true signals, periodic part, (F, S)
-    deflections: ComplexArray  # what they add to the deflections, periodic part, (F, E)
-    q: ComplexArray  # what they add to the degrees of freedom, periodic part, (F, n)
-    motion: FloatArray  # polynomial motion that they add, (DEGREE + 1, n)
-    rounds: int = 0  # how often a law was asked for its force over the whole record
+    sensors: ComplexArray  # response of the sensors' true signals, periodic part, (F, S)
+    deflections: ComplexArray  # response of the deflections, periodic part, (F, E)
+    q: ComplexArray  # response of the degrees of freedom, periodic part, (F, n)
+    motion: FloatArray  # polynomial response, (DEGREE + 1, n)
+    evaluations: int = 0  # of a law over the whole record, until the solution
 
     def index(self, term: Term) -> int:
-        """Which of the laws a term is, whatever its values."""
+        """Index of the law at the term's place, regardless of its parameter values."""
         return next(i for i, own in enumerate(self.terms) if own.key == term.key)
 
 
 def warm_start_of(forces: LawForces | None) -> tuple[FloatArray, ...]:
-    """The laws' forces as a start for a solution nearby, each (4N,)."""
+    """The laws' forces as initial guess for a nearby solution, each (4N,)."""
     return () if forces is None else tuple(forces.force.T)
 
 
 class HarmonicBalance:
-    """Laws and the motion along their ports under the laws' forces, on the oversampled axis.
+    """Equations of m laws and the plant between them, on the oversampled time axis (4N samples).
 
-    terms (m,) at elements with the springs and dampers `elements`, along ports (m, E) of the plant; d0 and v0 (4N, m)
-    are deflection and rate along them without the laws' forces.
+    terms: (m,), at the springs and dampers `elements`, along ports (m, E) of the plant.
+    motion: deflection (m) and rate (m/s) along the ports without the laws' forces, each (4N, m).
     """
 
     def __init__(
@@ -74,40 +74,40 @@ class HarmonicBalance:
         self.plant, self.grid = plant, plant.grid
         H = plant.structure.H
         self.terms, self.ports, self.elements = terms, ports, elements
-        self.wide = plant.structure.widened(ports)
+        self.wide = plant.structure.padded(ports)
         self._drive(*motion)
-        self.compliance = self._compliance(self.wide)  # (4N / 2 + 1, m, m)
+        self.compliance = self._compliance(self.wide)  # (2N + 1, m, m)
         self.jw = 2j * np.pi * np.fft.rfftfreq(len(self.d0), self.grid.step / OVERSAMPLING)
         self.lines = np.array([plant.line_motion(port) for port in self.wide])  # (m, 2, DEGREE + 1, n)
         self.line_d = np.einsum("bkpn,an->kpab", self.lines, self.wide @ H)
         self.powers = self.grid.fine_monomials
-        self.rounds = 0  # how often a law was asked for its force
+        self.evaluations = 0  # of a law over the whole record
 
     def _drive(self, d0: FloatArray, v0: FloatArray) -> None:
         self.d0, self.v0 = d0, v0
         self.reach = _REACH * np.abs(d0).max(axis=0), _REACH * np.abs(v0).max(axis=0)
 
-    def driven(self, motion: tuple[FloatArray, FloatArray]) -> HarmonicBalance:
-        """The same loop under other inputs or from another state: deflection and rate without the laws' forces."""
+    def under(self, motion: tuple[FloatArray, FloatArray]) -> HarmonicBalance:
+        """The same equations with another motion without the laws' forces (other inputs or another initial state)."""
         other = copy(self)
         other._drive(*motion)
         return other
 
-    def law(self, d: FloatArray, v: FloatArray) -> FloatArray:
-        """Forces along a motion (4N, m), without what the plant carries."""
-        return np.column_stack([self.law_of(i, d, v) for i in range(len(self.terms))])
+    def law_forces(self, d: FloatArray, v: FloatArray) -> FloatArray:
+        """Forces (4N, m) along a motion, each (4N, m), less the equivalents."""
+        return np.column_stack([self.law_force(i, d, v) for i in range(len(self.terms))])
 
-    def law_of(self, index: int, d: FloatArray, v: FloatArray) -> FloatArray:
-        """Force of one of the laws along a motion (4N, m) of all, (4N,)."""
-        self.rounds += 1
+    def law_force(self, index: int, d: FloatArray, v: FloatArray) -> FloatArray:
+        """Force (4N,) of one law along a motion of all, each (4N, m), less its equivalent."""
+        self.evaluations += 1
         term, time = self.terms[index], self.grid.start + self.grid.fine_time
         d, v = (np.clip(x[:, index], -reach[index], reach[index]) for x, reach in zip((d, v), self.reach, strict=True))
         force = force_along(term.element_law, term.parameters, d, v, time, self.elements[index])
         found: FloatArray = force - term.equivalent[0] * d - term.equivalent[1] * v
         return found
 
-    def answer(self, force: FloatArray, converged: bool = True) -> LawForces:
-        """What forces (4N, m) do to the system."""
+    def solution(self, force: FloatArray, converged: bool = True) -> LawForces:
+        """Response of the system to forces (4N, m)."""
         plant, grid = self.plant, self.grid
         d, v = self.motion(force)
         fine_spectrum, line = self.decompose(force)
@@ -116,13 +116,15 @@ class HarmonicBalance:
         sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ self.wide.T, spectrum)
         q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (self.wide @ plant.structure.H))
         deflections = q @ plant.structure.H.T
-        return LawForces(self.terms, self.ports, d, v, force, converged, sensors, deflections, q, motion, self.rounds)
+        return LawForces(
+            self.terms, self.ports, d, v, force, converged, sensors, deflections, q, motion, self.evaluations
+        )
 
     def _compliance(self, ports: FloatArray) -> ComplexArray:
-        """Deflection along the ports per force along them, also above the record's Nyquist frequency.
+        """Deflection along ports (m, E) per force along them, (2N + 1, m, m), up to the oversampled Nyquist frequency.
 
-        A law with a kink answers its own harmonics there: below from the plant, above from the state equations,
-        D = rows (j w - A)^-1 B by modes.
+        Laws with kinks produce harmonics above the record's Nyquist frequency.  Below it the plant's receptance is
+        used, above it the modal form of the state equations, rows (j w - A)^-1 B.
         """
         plant = self.plant
         s = plant.structure
@@ -136,9 +138,9 @@ class HarmonicBalance:
         return np.concatenate([known, above])
 
     def decompose(self, force: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """Periodic spectrum on the oversampled axis' bins, (4N / 2 + 1, m), and polynomial, (DEGREE + 1, m).
+        """Periodic spectrum on the oversampled axis' bins, (2N + 1, m), and polynomial, (DEGREE + 1, m).
 
-        The polynomial is the line that joins the ends, and the mean.
+        The polynomial consists of the line through both ends and the mean of the remainder.
         """
         line = np.zeros((DEGREE + 1, force.shape[1]))
         line[1] = force[-1] - force[0]
@@ -147,10 +149,10 @@ class HarmonicBalance:
         return rfft(rest - line[0], axis=0), line
 
     def motion(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Deflection and rate, 2 x (4N, m)."""
+        """Deflection and rate along the ports under forces (4N, m), each (4N, m)."""
         spectrum, line = self.decompose(force)
         answer = np.einsum("fab,fb->af", self.compliance, spectrum)
-        swinging = irfft(np.stack([answer, self.jw * answer]), len(self.d0))  # both at once: contiguous, so quick
+        swinging = irfft(np.stack([answer, self.jw * answer]), len(self.d0))  # one transform of contiguous series
         steady = np.einsum("kpab,kb->pa", self.line_d, line[:2])
         d, v = swinging.transpose(0, 2, 1)
         return self.d0 + d + self.powers @ steady, self.v0 + v + self.powers @ self.plant.derivative(steady)
@@ -166,7 +168,7 @@ def fixed_point(
     shape = start.shape
     x = start.ravel()
     image = step(start).ravel()
-    history = _History(x.size)
+    history = _AndersonHistory(x.size)
     best, best_size, sizes = image, np.inf, []
     for iteration in range(_ITERATIONS):
         residual = image - x
@@ -180,13 +182,13 @@ def fixed_point(
         sizes.append(best_size)
         if iteration >= patience and best_size > _PROGRESS * sizes[-patience]:
             break
-        x = history.mixed(image, residual)
+        x = history.next_iterate(image, residual)
         image = step(x.reshape(shape)).ravel()
     return best.reshape(shape), False
 
 
-class _History:
-    """The last images and residuals of a fixed-point iteration, as differences from one to the next."""
+class _AndersonHistory:
+    """Differences of successive images and residuals of a fixed-point iteration, of the last few iterates."""
 
     def __init__(self, size: int) -> None:
         self.images, self.residuals = np.empty((_HISTORY - 1, size)), np.empty((_HISTORY - 1, size))
@@ -194,10 +196,10 @@ class _History:
         self.count = 0
         self.last: tuple[FloatArray, FloatArray] | None = None
 
-    def mixed(self, image: FloatArray, residual: FloatArray) -> FloatArray:
-        """The next point: the image less what the differences make of the residual by least squares."""
+    def next_iterate(self, image: FloatArray, residual: FloatArray) -> FloatArray:
+        """The next iterate: the image less the combination of differences that minimises the residual."""
         if self.last is not None:
-            at = self.count % len(self.images)  # the oldest makes room
+            at = self.count % len(self.images)  # the oldest is overwritten
             self.count += 1
             np.subtract(image, self.last[0], out=self.images[at])
             np.subtract(residual, self.last[1], out=self.residuals[at])

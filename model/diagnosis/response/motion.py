@@ -1,4 +1,4 @@
-"""The whole motion of a solution: periodic, polynomial and free."""
+"""The total motion of a solution: periodic, polynomial and free part."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sprung.model.signals import FloatArray
 
 @dataclass(frozen=True)
 class Motions:
-    """Whole motion of a part as spectra: rates are transformed on their own, since a record's ends do not meet."""
+    """Total motion of a part as spectra; rates are transformed separately, since records are not periodic."""
 
     deflection: ComplexArray  # (F, elements)
     rate: ComplexArray  # (F, elements)
@@ -55,7 +55,7 @@ def _periodic_motion(forward: Forward, forces: LawForces | None) -> ComplexArray
 
 
 def particular_start(forward: Forward, forces: LawForces | None) -> FloatArray:
-    """State of the particular solution at the first sample; with the free state it is the true state, (2n + b,)."""
+    """State (2n + b,) of the particular solution at the first sample; the free state is added to it."""
     plant, grid = forward.plant, forward.part.grid
     q = _periodic_motion(forward, forces)
     polynomial = forward.polynomial[0] + (0.0 if forces is None else forces.motion)

@@ -1,12 +1,13 @@
-"""Newton's steps for laws that shape their own motion strongly, such as stops that are hit again and again.
+"""Newton's method for laws that dominate their own motion, such as stops that are hit repeatedly.
 
-A force's change answers itself through the plant: with slopes s of the laws over deflection and rate,
+A change of the forces acts on itself through the plant.  With the laws' slopes s over deflection and rate, the Newton
+correction of forces f whose defect is  law(motion(f)) - f  solves
 
-    change = s motion(change) + what is missing,
+    correction = s motion(correction) + defect,
 
-a linear system that varies over time.  It is marched step by step, the force linear in between; before its beginning a
-periodic motion was what it is before its end.  The iteration around whole trajectories then needs only what the two
-ways to simulate differ by.
+a linear time-varying system with periodic boundary conditions.  It is integrated step by step with a first-order hold
+on the forces.  The iteration over whole trajectories then only has to correct the difference between this integration
+and the frequency response.
 """
 
 from __future__ import annotations
@@ -21,53 +22,57 @@ from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance
 from sprung.model.signals import FloatArray
 
 PATIENCE = 8  # steps in which the error has to halve
-_MEMORY = 1.5  # time constants of the slowest mode that a march begins earlier
-_STEP = 1e-3  # of a motion's deviation, for the slopes
-_MARCH = 30  # rounds of a law that a march takes as long as
-_AT_ONCE = 1e5  # stretches times states cubed that take as long as calling for them
-_DEARER = 2.0  # times that a step of them from every state takes what one from rest takes
+_RUN_IN = 1.5  # time constants of the slowest mode, integrated before a segment
+_STEP = 1e-3  # of a motion's standard deviation, for finite differences
+_EVALUATIONS = 30  # of a law, whose cost equals that of one correction
+_SEGMENTS = 1e5  # segments times states cubed at which arithmetic costs as much as the calls
+_RELATIVE_COST = 2.0  # of a multiple-shooting step over one of single shooting
 
-Hold = tuple[FloatArray, FloatArray, FloatArray]  # transition, and what forces at its beginning and its end add
+FirstOrderHold = tuple[
+    FloatArray, FloatArray, FloatArray
+]  # transition matrix (n, n), and input matrices (n, m) of the force at either end
 
 
-def newton_step(loop: HarmonicBalance) -> Callable[[FloatArray], FloatArray] | None:
-    """The next forces (4N, m) from the present ones; None where every law has a memory, and so no slope."""
-    instant = [i for i, term in enumerate(loop.terms) if not term.element_law.memory]
-    if not instant:
+def newton_step(balance: HarmonicBalance) -> Callable[[FloatArray], FloatArray] | None:
+    """Map from forces (4N, m) to their Newton iterate; None where all laws have memory, and therefore no slope."""
+    memoryless = [i for i, term in enumerate(balance.terms) if not term.element_law.memory]
+    if not memoryless:
         return None
-    s, step = loop.plant.structure, loop.grid.step / OVERSAMPLING
+    s, step = balance.plant.structure, balance.grid.step / OVERSAMPLING
     A = s.state_matrix()
-    hold = _hold(A, s.force_columns(loop.wide), step)
-    memory = _MEMORY / (step * max(float(np.min(-np.linalg.eigvals(A).real)), 1e-9))
-    rows = s.motion_rows(loop.wide)  # deflections of the ports, then rates
+    hold = _first_order_hold(A, s.force_columns(balance.wide), step)
+    memory = _RUN_IN / (step * max(float(np.min(-np.linalg.eigvals(A).real)), 1e-9))
+    rows = s.motion_rows(balance.wide)  # deflections of the ports, then rates
 
-    def improved(force: FloatArray) -> FloatArray:
-        d, v = loop.motion(force)
-        present = loop.law(d, v)
-        by_d, by_v = _slopes(loop, instant, d, v)
-        m = len(loop.terms)
-        loop.rounds += _MARCH
+    def corrected(force: FloatArray) -> FloatArray:
+        d, v = balance.motion(force)
+        present = balance.law_forces(d, v)
+        by_d, by_v = _slopes(balance, memoryless, d, v)
+        m = len(balance.terms)
+        balance.evaluations += _EVALUATIONS
         gains = by_d[:, :, None] * rows[:m] + by_v[:, :, None] * rows[m:]  # force per state, (4N, m, states)
-        return force + answered(hold, gains, present - force, memory)
+        return force + periodic_response(hold, gains, present - force, memory)
 
-    return improved
+    return corrected
 
 
-def _slopes(loop: HarmonicBalance, instant: list[int], d: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Slopes of the laws' forces over deflection and rate along a motion, without the equivalents, 2 x (4N, m).
+def _slopes(
+    balance: HarmonicBalance, memoryless: list[int], d: FloatArray, v: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Slopes of the laws' forces over deflection and rate along a motion, less the equivalents, each (4N, m).
 
-    Laws with memory have no slope in one instant: for them the equivalent stands.
+    Laws with memory have no instantaneous slope; their equivalent linearisation is used instead.
     """
     by_d, by_v = np.zeros_like(d), np.zeros_like(v)
     h = _STEP * d.std(axis=0) + 1e-300, _STEP * v.std(axis=0) + 1e-300
-    for i in instant:
-        by_d[:, i] = (loop.law_of(i, d + h[0], v) - loop.law_of(i, d - h[0], v)) / (2 * h[0][i])
-        by_v[:, i] = (loop.law_of(i, d, v + h[1]) - loop.law_of(i, d, v - h[1])) / (2 * h[1][i])
+    for i in memoryless:
+        by_d[:, i] = (balance.law_force(i, d + h[0], v) - balance.law_force(i, d - h[0], v)) / (2 * h[0][i])
+        by_v[:, i] = (balance.law_force(i, d, v + h[1]) - balance.law_force(i, d, v - h[1])) / (2 * h[1][i])
     return by_d, by_v
 
 
-def _hold(A: FloatArray, B: FloatArray, step: float) -> Hold:
-    """Transition of the states over a step, and what forces at its beginning and its end add, linear in between."""
+def _first_order_hold(A: FloatArray, B: FloatArray, step: float) -> FirstOrderHold:
+    """First-order hold: transition of the states over a step, and the effect of the forces at its two ends."""
     n, m = B.shape
     block = np.zeros((n + 2 * m, n + 2 * m))
     block[:n, :n], block[:n, n : n + m] = A * step, B * step
@@ -77,32 +82,32 @@ def _hold(A: FloatArray, B: FloatArray, step: float) -> Hold:
     return found[:n, :n], found[:n, n : n + m] - end, end
 
 
-def answered(hold: Hold, gains: FloatArray, missing: FloatArray, memory: float) -> FloatArray:
-    """Forces f (T, m) with f = gains x + missing, x the states that f drives, periodic.
+def periodic_response(hold: FirstOrderHold, gains: FloatArray, defect: FloatArray, memory: float) -> FloatArray:
+    """Forces f (T, m) with f = gains x + defect, where x are the states (T, n) of the periodic response to f.
 
-    Stretches of the record are marched beside each other: each from so many steps (`memory`) before it, or, where a
-    structure remembers for too long, each from every state at once.
+    gains: (T, m, n); defect: (T, m).  Segments of the record are integrated in parallel: each from rest, `memory`
+    steps before it begins, or, where that costs more, by multiple shooting.
     """
-    total, states = len(missing), len(hold[0])
+    total, states = len(defect), len(hold[0])
     before = int(min(np.ceil(memory), total))
-    many = int(np.clip(_AT_ONCE / states**3, 4, total // 4))
-    inverse = np.linalg.inv(np.eye(missing.shape[1]) - gains @ hold[2])  # (T, m, m)
-    rows, right = inverse @ gains, (inverse @ missing[:, :, None])[:, :, 0]
-    with np.errstate(all="ignore"):  # steps that diverge are not taken
-        if _DEARER * total < before * many:
-            return _joined(hold, gains, missing, (rows, right), many)
-        return _marched(hold, (rows, right), before)
+    count = int(np.clip(_SEGMENTS / states**3, 4, total // 4))
+    inverse = np.linalg.inv(np.eye(defect.shape[1]) - gains @ hold[2])  # (T, m, m)
+    rows, right = inverse @ gains, (inverse @ defect[:, :, None])[:, :, 0]
+    with np.errstate(all="ignore"):  # diverging corrections are rejected by the caller
+        if _RELATIVE_COST * total < before * count:
+            return _multiple_shooting(hold, gains, defect, (rows, right), count)
+        return _integrated_from_rest(hold, (rows, right), before)
 
 
-def _marched(hold: Hold, solved: tuple[FloatArray, FloatArray], before: int) -> FloatArray:
-    """Stretches from rest, so many steps before each of them."""
+def _integrated_from_rest(hold: FirstOrderHold, solved: tuple[FloatArray, FloatArray], before: int) -> FloatArray:
+    """Segments integrated from rest, beginning `before` steps ahead of each."""
     transition, begin, end = hold
     rows, right = solved
     total = len(right)
-    stretches = total // before
-    length = -(-total // stretches)
-    first = length * np.arange(stretches)
-    x, f = np.zeros((len(transition), stretches)), np.zeros((right.shape[1], stretches))
+    segments = total // before
+    length = -(-total // segments)
+    first = length * np.arange(segments)
+    x, f = np.zeros((len(transition), segments)), np.zeros((right.shape[1], segments))
     result = np.empty_like(right)
     for k in range(-before, length):
         at = (first + k) % total
@@ -114,24 +119,28 @@ def _marched(hold: Hold, solved: tuple[FloatArray, FloatArray], before: int) -> 
     return result
 
 
-def _joined(
-    hold: Hold, gains: FloatArray, missing: FloatArray, solved: tuple[FloatArray, FloatArray], many: int
+def _multiple_shooting(
+    hold: FirstOrderHold,
+    gains: FloatArray,
+    defect: FloatArray,
+    solved: tuple[FloatArray, FloatArray],
+    count: int,
 ) -> FloatArray:
-    """Stretches from every state at once: each maps the state before it to that at its end, x' = P x + r.
+    """Segments as affine maps of their initial states, x' = P x + r.
 
-    The maps in a row tell the state that comes back to itself, and with it those before all stretches.
+    The fixed point of their composition is the periodic initial state; it determines those of all segments.
     """
     transition, begin, end = hold
     rows, right = solved
     total, states = len(right), len(transition)
-    length = -(-total // many)
+    length = -(-total // count)
     first = length * np.arange(-(-total // length))
 
-    def stepped(x: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
-        """States (stretches, n, columns) a step on, and the forces; the last column alone feels what is missing."""
+    def advanced(x: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
+        """States (segments, n, columns) one step later, and the forces; the defect acts on the last column only."""
         at = np.minimum(first + k, total - 1)
         f = gains[at - 1] @ x
-        f[:, :, -1] += missing[at - 1]
+        f[:, :, -1] += defect[at - 1]
         moved = transition @ x + begin @ f
         f = rows[at] @ moved
         f[:, :, -1] += right[at]
@@ -140,18 +149,18 @@ def _joined(
 
     maps = np.tile(np.eye(states, states + 1), (len(first), 1, 1))
     for k in range(length):
-        maps, _ = stepped(maps, k)
+        maps, _ = advanced(maps, k)
     whole = np.eye(states, states + 1)
     for one in maps:
         whole = one[:, :-1] @ whole
         whole[:, -1] += one[:, -1]
-    if not np.all(np.isfinite(whole)):  # nothing comes back to itself
+    if not np.all(np.isfinite(whole)):  # no periodic solution
         return np.full_like(right, np.nan)
     x = [np.linalg.lstsq(np.eye(states) - whole[:, :-1], whole[:, -1], rcond=None)[0]]
     for one in maps[:-1]:
         x.append(one[:, :-1] @ x[-1] + one[:, -1])
     now, result = np.array(x)[:, :, None], np.empty((len(first) * length, right.shape[1]))
     for k in range(length):
-        now, f = stepped(now, k)
+        now, f = advanced(now, k)
         result[first + k] = f[:, :, 0]
     return result[:total]

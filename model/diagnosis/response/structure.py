@@ -1,4 +1,4 @@
-"""Matrices of the linear system with laws of bodies and Maxwell branches in place, and its state equations."""
+"""Matrices and state equations of the linear system, with laws of bodies and Maxwell branches included."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from sprung.model.signals import FloatArray
 
 @dataclass(frozen=True)
 class Branch:
-    """A spring and a damper in series beside an element, force s' = stiffness v - s / time (Maxwell)."""
+    """Maxwell element parallel to an element: spring and damper in series, force s' = stiffness v - s / time."""
 
     element: int
     stiffness: float  # N/m
-    time: float  # s, damper over spring
-    replaces: float = 0.0  # N s/m, what of the element's damper is in the branch
-    of_spring: bool = False  # whether its stiffness is a share of the element's own
+    time: float  # s, relaxation time: damper over spring
+    replaces: float = 0.0  # N s/m, the part of the element's damper that the branch replaces
+    of_spring: bool = False  # whether its stiffness is proportional to the element's
 
     def impedance(self, omega: FloatArray) -> ComplexArray:
-        """What the branch adds to k + j w c, N/m, (F,)."""
+        """Dynamic stiffness beside k + j w c, N/m, (F,); omega: rad/s, (F,)."""
         jw = 1j * omega
         return np.asarray(jw * self.per_rate(omega))
 
     def per_rate(self, omega: FloatArray) -> ComplexArray:
-        """The same per rate, N s/m, (F,): the rate of a motion whose ends do not meet has a spectrum of its own."""
+        """Force per rate, N s/m, (F,).  Rates of non-periodic motions have spectra of their own."""
         return np.asarray(self.stiffness * self.time / (1 + 1j * omega * self.time) - self.replaces)
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Matrices and values of a system, possibly with elastic modes appended as further degrees of freedom.
+    """Matrices of a system, elastic modes appended as further degrees of freedom.
 
-    State of the free motion: [q, q', forces of the branches], 2n + b.
+    State of the free motion: [q, q', forces of the branches], 2n + b.  SI units.
     """
 
     mass: FloatArray  # (n,)
     stiffness: FloatArray  # (E,)
     damping: FloatArray  # (E,)
-    own_stiffness: FloatArray  # of elastic modes against their body, (n,)
-    own_damping: FloatArray  # (n,)
+    modal_stiffness: FloatArray  # of elastic modes, zero elsewhere, (n,)
+    modal_damping: FloatArray  # (n,)
     H: FloatArray  # (E, n)
     G: FloatArray  # (E, supports)
     F: FloatArray  # (n, forces)
@@ -54,14 +54,14 @@ class Structure:
 
     @classmethod
     def nominal(cls, mechanics: Mechanics, sensors: np.ndarray) -> Structure:
-        """The structure of the system file, seen by the sensors of the given indices."""
+        """The structure of the system file with the sensors of the given indices (S,)."""
         n = mechanics.n
         return cls(
             mass=mechanics.mass,
             stiffness=mechanics.stiffness,
             damping=mechanics.damping,
-            own_stiffness=np.zeros(n),
-            own_damping=np.zeros(n),
+            modal_stiffness=np.zeros(n),
+            modal_damping=np.zeros(n),
             H=mechanics.H,
             G=mechanics.G,
             F=mechanics.F,
@@ -72,25 +72,25 @@ class Structure:
         )
 
     def same(self, other: Structure) -> bool:
-        """Whether another structure has the same matrices and values."""
+        """Whether another structure is equal in all matrices and branches."""
         pairs = ((getattr(self, one.name), getattr(other, one.name)) for one in fields(self) if one.name != "branches")
         return self.branches == other.branches and all(np.array_equal(mine, theirs) for mine, theirs in pairs)
 
     @property
     def K(self) -> FloatArray:
-        return (self.H.T * self.stiffness) @ self.H + np.diag(self.own_stiffness)
+        return (self.H.T * self.stiffness) @ self.H + np.diag(self.modal_stiffness)
 
     @property
     def C(self) -> FloatArray:
-        return (self.H.T * self.damping) @ self.H + np.diag(self.own_damping)
+        return (self.H.T * self.damping) @ self.H + np.diag(self.modal_damping)
 
     @property
     def steady_C(self) -> FloatArray:
-        return (self.H.T * self.steady_damping) @ self.H + np.diag(self.own_damping)
+        return (self.H.T * self.steady_damping) @ self.H + np.diag(self.modal_damping)
 
     @property
     def steady_damping(self) -> FloatArray:
-        """Force per rate of the elements in steady motion, N s/m, (E,)."""
+        """Damping of the elements in steady motion, N s/m, (E,): branches relaxed."""
         damping = self.damping.copy()
         for branch in self.branches:
             damping[branch.element] += branch.stiffness * branch.time - branch.replaces
@@ -113,12 +113,12 @@ class Structure:
             A[i, i] = -1 / branch.time
         return A
 
-    def widened(self, ports: FloatArray) -> FloatArray:
-        """Weights (m, E) over the system's elements as weights over all elements here, elastic modes' included."""
+    def padded(self, ports: FloatArray) -> FloatArray:
+        """Ports (m, E) over the system's elements, padded by zeros to those of this structure."""
         return np.pad(ports, ((0, 0), (0, len(self.H) - ports.shape[1])))
 
     def motion_rows(self, ports: FloatArray) -> FloatArray:
-        """Deflections along ports (m, E), then their rates, over the state, (2m, 2n + b)."""
+        """Output rows (2m, 2n + b): deflections along ports (m, E), then their rates."""
         along = ports @ self.H
         m, n = along.shape
         rows = np.zeros((2 * m, self.states))
@@ -126,14 +126,14 @@ class Structure:
         return rows
 
     def force_columns(self, ports: FloatArray) -> FloatArray:
-        """What forces along ports (m, E) do to the state's rate, (2n + b, m)."""
+        """Input columns (2n + b, m) of forces along ports (m, E)."""
         n = len(self.mass)
         columns = np.zeros((self.states, len(ports)))
         columns[n : 2 * n] = -(ports @ self.H).T / self.mass[:, None]
         return columns
 
     def sensor_rows(self) -> FloatArray:
-        """Sensors over the state of free motion, shape (S, 2n + b)."""
+        """Output rows of the sensors in free motion, (S, 2n + b)."""
         n = len(self.mass)
         of_elements = element_outputs(self.sensor_kind, self.L, self.stiffness, self.damping)
         rows = state_outputs(self.sensor_kind, self.S, self.H, self.state_matrix(), of_elements)
@@ -144,7 +144,7 @@ class Structure:
         return rows
 
     def branch_forces(self, deflections: ComplexArray, omega: FloatArray) -> ComplexArray:
-        """Forces of the branches along periodic deflections (F, E), (F, b)."""
+        """Forces of the branches, N, (F, b), along periodic deflections (F, E), m; omega: rad/s, (F,)."""
         jw = 1j * omega
         columns = [b.stiffness * b.time * jw / (1 + jw * b.time) * deflections[:, b.element] for b in self.branches]
         return np.stack(columns, axis=1) if columns else np.zeros((len(omega), 0), dtype=complex)

@@ -1,4 +1,4 @@
-"""A law at a place with values: what is added to the nominal structure."""
+"""Terms: laws with a location and values, added to the nominal structure."""
 
 from __future__ import annotations
 
@@ -11,43 +11,44 @@ from sprung.model.laws import BodyLaw, ElementLaw, Law, SensorLaw, SpringDamper,
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-WIDER = "wider"  # variant of an element law: with more parameters than it has as a rule
+WIDER = "wider"  # variant of an element law with further parameters
 
 
 @dataclass(frozen=True)
 class Term:
-    """One law at one place.  Parameters in the law's order."""
+    """One law at one location; parameters in the law's order and units."""
 
     law: Law
     location: str  # element, body, support, sensor or input channel; "left|right" of a pair or an axle
     parameters: tuple[float, ...]
-    variant: str = ""  # of body laws: the mode's shape, the direction of a force
-    equivalent: tuple[float, float] = (0.0, 0.0)  # stiffness and damping of the law's equivalent, kept by the plant
+    variant: str = ""  # of body laws: shape of the mode, or direction of the force
+    equivalent: tuple[float, float] = (0.0, 0.0)  # equivalent stiffness N/m and damping N s/m, part of the plant
 
-    scales: tuple[float, ...] = ()  # sizes at which the parameters matter, for steps and bounds; as `parameters`
-    fixed: tuple[bool, ...] = ()  # parameters that the system file holds; as `parameters`, none if left out
-    known: tuple[float, ...] = ()  # deviations from absence that are expected; as `parameters`, any if left out
+    scales: tuple[float, ...] = ()  # typical sizes, for steps and bounds; as `parameters`
+    fixed: tuple[bool, ...] = ()  # held constant by the system file; as `parameters`, or empty: none
+    known: tuple[float, ...] = ()  # prior standard deviation about absence; as `parameters`, or empty: no prior
 
     def at(self, parameters: FloatArray) -> Term:
         return replace(self, parameters=tuple(float(v) for v in parameters))
 
     @property
     def element_law(self) -> ElementLaw:
-        """The law, of a term that acts along an element."""
+        """The law of a term that acts along an element.  Errors: `TypeError` for other laws."""
         if not isinstance(self.law, ElementLaw):
-            raise TypeError(f"{self.law.name} at {self.location} is no law of an element")
+            raise TypeError(f"{self.law.name} at {self.location} is not a law of an element")
         return self.law
 
     def moved(self, index: int, step: float) -> Term:
-        """One internal parameter moved: the logarithm of those of unknown order, else the value."""
+        """The term with one internal parameter (logarithm or value, as the law says) changed by a step."""
         values = list(self.parameters)
         values[index] = values[index] * np.exp(step) if self.law.parameters[index].log else values[index] + step
         return replace(self, parameters=tuple(values))
 
     def advanced(self, step: FloatArray) -> Term:
-        """All internal parameters moved but those that are held, values kept within the law's bounds.
+        """The term after a step (p,) of its internal parameters; held ones stay, others are kept within their bounds.
 
-        Steps are limited in their direction: a yield deflection that stays as its exponent moves takes both.
+        Steps are shortened along their direction, since coupled parameters (yield deflection and exponent) must
+        move together.
         """
         values = []
         largest = max((abs(x) for spec, x in zip(self.law.parameters, step, strict=True) if spec.log), default=0.0)
@@ -58,21 +59,21 @@ class Term:
             values.append(value if held else float(min(max(new, spec.low), spec.high)))
         return replace(self, parameters=tuple(values))
 
-    def held_back(self, step: FloatArray) -> list[bool]:
-        """Which parameters stand at a bound that a step would take them over."""
+    def at_active_bounds(self, step: FloatArray) -> list[bool]:
+        """Which parameters (p,) are held, or at a bound that the step (p,) would cross."""
         fixed = self.fixed or (False,) * len(self.parameters)
         entries = zip(self.law.parameters, self.parameters, step, fixed, strict=True)
         return [f or (v <= spec.low and s < 0) or (v >= spec.high and s > 0) for spec, v, s, f in entries]
 
     @property
     def slopes(self) -> FloatArray:
-        """Derivative of each parameter with respect to its internal form."""
+        """Derivatives of the parameters by their internal form, (p,)."""
         pairs = zip(self.law.parameters, self.parameters, strict=True)
         return np.array([value if spec.log else 1.0 for spec, value in pairs])
 
     @property
-    def strayed(self) -> FloatArray:
-        """Distance of each parameter from absence in expected deviations; 0 where none is expected."""
+    def prior_deviations(self) -> FloatArray:
+        """Distances of the parameters from absence in prior standard deviations, (p,); 0 without a prior."""
         away = np.zeros(len(self.parameters))
         for i, spread in enumerate(self.known):
             away[i] = (self.parameters[i] - self.law.absent[i]) / spread
@@ -80,7 +81,7 @@ class Term:
 
     @property
     def bounded(self) -> bool:
-        """Whether a parameter has stopped at a bound."""
+        """Whether a parameter is at one of its bounds."""
         pairs = zip(self.law.parameters, self.parameters, strict=True)
         return any(value <= spec.low or value >= spec.high for spec, value in pairs)
 
@@ -89,7 +90,7 @@ class Term:
         return (self.location, self.law.name, self.variant)
 
     def port(self, system: System) -> FloatArray:
-        """Weights over elements: the law sees port @ deflections and pulls the elements by port * force."""
+        """Weights (E,) over elements: the law acts along port @ deflections, and on the elements with port * force."""
         weights = np.zeros(len(system.elements))
         names = self.location.split("|")
         weights[system.elements.index(names[0])] = 1.0
@@ -99,7 +100,7 @@ class Term:
 
 
 def given_terms(system: System) -> tuple[Term, ...]:
-    """The laws that the system file puts in place, but for faults of measurements, which are undone in the signals."""
+    """The laws of the system file, except faults of measurements, which are compensated in the signals."""
     found = []
     for placed in system.laws:
         law = placed.law
@@ -118,14 +119,14 @@ def given_terms(system: System) -> tuple[Term, ...]:
 
 
 def supports(system: System) -> list[str]:
-    """The inputs that move: moving supports, in the order of their columns."""
+    """Names of the moving supports, in the order of their columns."""
     return [name for name, source in system.file.inputs.items() if source.kind != "force"]
 
 
 def branches_of(term: Term, system: System, structure: Structure) -> tuple[Branch, ...]:
-    """The branches that a law with linear memory puts beside its elements; none: it is no such law.
+    """Maxwell branches of a law with linear memory, parallel to its elements; empty for other laws.
 
-    structure: of the model, with its stiffnesses and dampings.
+    structure: with the stiffness and damping of the elements.
     """
     law = term.law
     places = [system.elements.index(name) for name in term.location.split("|") if name in system.elements]
@@ -137,6 +138,6 @@ def branches_of(term: Term, system: System, structure: Structure) -> tuple[Branc
     return ()
 
 
-def is_waveform(term: Term) -> bool:
-    """Whether the law's force is found along the trajectory, in the loop."""
+def evaluated_in_time(term: Term) -> bool:
+    """Whether the law's force is evaluated in time along the trajectory, by harmonic balance."""
     return isinstance(term.law, ElementLaw) and term.law.branch is None

@@ -1,7 +1,7 @@
-"""Forces of laws step by step in time, for trajectories on which the iteration of `forward` does not settle.
+"""Time stepping of laws' forces, for trajectories on which the harmonic balance does not converge.
 
-A hard stop that is hit all over a long record makes the iteration on whole trajectories diverge when it starts far
-away.  Marching never does; it ends in a trajectory that the iteration then takes as its start.
+With a hard stop that is hit throughout a long record, the iteration over whole trajectories diverges from a remote
+start.  Time stepping does not, and its result is the initial guess of that iteration.
 """
 
 from __future__ import annotations
@@ -24,50 +24,50 @@ from sprung.model.simulate.etd import Site, force_steps
 from sprung.model.simulate.segments import solve
 
 _PARTS = 2 * OVERSAMPLING  # steps per sample
-_HANDED = 1e-4  # change of the states that one stretch hands to the next
+_HANDED = 1e-4  # change of the states passed from one segment to the next
 
 
 def march_from_rest(forward: Forward, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Forces of every law along its trajectory less its equivalent, (OVERSAMPLING N, laws), and a state, (2n + b,).
+    """Forces of the laws along their trajectory less their equivalents, (OVERSAMPLING N, m), and a state, (2n + b,).
 
-    state (2n + b,): the free motion at the first sample, beside which the laws' part begins at rest.  `forward` counts
-    the free motion beside a periodic part, which moves at the first sample: what is returned is to be taken off.
+    state: of the free motion at the first sample, (2n + b,); the response to the laws begins at rest.  `forward` adds
+    the free motion to a periodic response, which is in motion at the first sample: subtract the returned state.
     """
-    loop = _loop(forward, state)
-    force = _march(loop, slice(0, None), np.zeros(loop.plant.structure.states))
-    return force, _state_at(loop.plant, loop.answer(force), 0)
+    balance = _balance_of(forward, state)
+    force = _march(balance, slice(0, None), np.zeros(balance.plant.structure.states))
+    return force, _state_at(balance.plant, balance.solution(force), 0)
 
 
-def march_on(forward: Forward, state: FloatArray, first: int) -> FloatArray:
-    """The same from sample `first` on, the forces up to there being known: those that `forward` starts from."""
-    loop = _loop(forward, state)
-    force = np.column_stack(forward.start_force)
+def march_from(forward: Forward, state: FloatArray, first: int) -> FloatArray:
+    """Forces (OVERSAMPLING N, m), integrated from sample `first` on; earlier ones are those of the warm start."""
+    balance = _balance_of(forward, state)
+    force = np.column_stack(forward.warm_start)
     held = slice(first * OVERSAMPLING, None)
-    force[held] = _march(loop, held, _state_at(loop.plant, loop.answer(force), first))
+    force[held] = _march(balance, held, _state_at(balance.plant, balance.solution(force), first))
     return force
 
 
-def _loop(forward: Forward, state: FloatArray) -> HarmonicBalance:
-    loop = forward.loop(state)
-    if loop is None:
-        raise ValueError("no law of this model acts along a trajectory")
-    return loop
+def _balance_of(forward: Forward, state: FloatArray) -> HarmonicBalance:
+    balance = forward.harmonic_balance(state)
+    if balance is None:
+        raise ValueError("no law of this model is evaluated in time")
+    return balance
 
 
-def _march(loop: HarmonicBalance, part: slice, begin: FloatArray) -> FloatArray:
-    """Forces along a part of the fine axis, (4N', laws), from the state of their motion."""
-    grid, s, d0, v0 = loop.grid, loop.plant.structure, loop.d0[part], loop.v0[part]
-    A, rows = s.state_matrix(), s.motion_rows(loop.wide)
+def _march(balance: HarmonicBalance, part: slice, begin: FloatArray) -> FloatArray:
+    """Forces along a part of the oversampled axis, (4N', m), from an initial state (2n + b,)."""
+    grid, s, d0, v0 = balance.grid, balance.plant.structure, balance.d0[part], balance.v0[part]
+    A, rows = s.state_matrix(), s.motion_rows(balance.wide)
     step = grid.step / _PARTS
     fine = grid.step / OVERSAMPLING * np.arange(len(d0))
     nodes = step / 2 * np.arange(2 * _PARTS * (len(d0) // OVERSAMPLING - 1) + 1)
     inputs = np.hstack([CubicHermiteSpline(fine, d0, v0)(nodes), CubicSpline(fine, v0)(nodes)])
     solution = solve(
-        force_steps(A, s.force_columns(loop.wide), rows, step),
+        force_steps(A, s.force_columns(balance.wide), rows, step),
         expm(A * grid.step),
         [
             Site(_without_equivalent(term, reach), term.parameters, element)
-            for term, element, reach in zip(loop.terms, loop.elements, np.transpose(loop.reach), strict=True)
+            for term, element, reach in zip(balance.terms, balance.elements, np.transpose(balance.reach), strict=True)
         ],
         (inputs + propagate(A, rows, begin, step / 2, len(nodes)))[..., None],
         parts=_PARTS,
@@ -79,7 +79,7 @@ def _march(loop: HarmonicBalance, part: slice, begin: FloatArray) -> FloatArray:
 
 
 def _without_equivalent(term: Term, reach: FloatArray) -> ElementLaw:
-    """The law less the linear part that the plant carries, flat beyond its reach (deflection, rate)."""
+    """The law less its equivalent, constant beyond its reach (deflection m, rate m/s)."""
     law, (stiffness, damping) = term.element_law, term.equivalent
 
     def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
@@ -90,7 +90,7 @@ def _without_equivalent(term: Term, reach: FloatArray) -> ElementLaw:
 
 
 def _state_at(plant: Plant, forces: LawForces, sample: int) -> FloatArray:
-    """State at a sample, (2n + b,), of the motion that periodic forces keep up."""
+    """State (2n + b,) at a sample of the periodic response to forces."""
     grid = plant.grid
     q, bend = (grid.monomials[sample] @ p for p in (forces.motion, plant.derivative(forces.motion)))
     position = grid.inverse(forces.q)[sample] + q

@@ -10,7 +10,7 @@ import numpy as np
 
 from sprung.model.chunks import WORKERS, share
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray
-from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, is_waveform
+from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, evaluated_in_time
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.screening.places import places
 from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
@@ -57,7 +57,7 @@ class TrialElement:
     def of_terms(self, terms: list[Term]) -> ComplexArray:
         """Forces of the terms of one law over the compared bins, (m, F)."""
         grid = self.projector.grid
-        if is_waveform(terms[0]):
+        if evaluated_in_time(terms[0]):
             time = grid.start + grid.fine_time
             forces = [
                 force_along(term.element_law, term.parameters, self.deflection, self.rate, time, self.element)

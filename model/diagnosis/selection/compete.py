@@ -15,7 +15,7 @@ from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.rules import RULES, EvidenceRules, Rules, SelectionRules
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.selection.evidence import (
@@ -88,7 +88,7 @@ def shortlist(
     for candidate in good:
         s = candidate.strength(screened)
         share = chosen_by.close if candidate.location == place else chosen_by.close_elsewhere
-        known = gross and candidate.location == place and candidate.term.law.named and is_waveform(candidate.term)
+        known = gross and candidate.location == place and candidate.term.law.named and evaluated_in_time(candidate.term)
         if s < share * top and s < top - chosen_by.near and not known:
             continue
         if not candidate.term.law.named:
@@ -201,7 +201,7 @@ def _begun(problem: Problem, base: Fit, candidate: Candidate, again: bool = Fals
 
     again: whether a law with look-alikes of its own starts from those too, where its first fits leave much.
     """
-    problem = replace(problem, patient=False)
+    problem = replace(problem, newton_allowed=False)
     starts = starts_of(problem, base, candidate)
     tried = [t for t in (_try(problem, base, candidate, start, 3) for start in starts) if t is not None]
     best = max(tried, key=lambda t: t.evidence, default=None)

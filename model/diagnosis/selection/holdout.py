@@ -17,7 +17,7 @@ from sprung.model.diagnosis.record.spectra import ComplexArray, Grid
 from sprung.model.diagnosis.response.forward import Forward, propagate
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.time_stepping import march_from_rest, march_on
+from sprung.model.diagnosis.response.time_stepping import march_from, march_from_rest
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.diagnosis.selection.evidence import process_gain
 from sprung.model.signals import BoolArray, FloatArray
@@ -200,13 +200,13 @@ class HeldOut:
         Forces that follow the sensors until there tell the state from which the run goes on in the next.  rest: what
         the state lacks of that beside which the laws' part begins at rest; it comes back as this round has it.
         """
-        loop = forward.loop(state)
-        if loop is None:
+        balance = forward.harmonic_balance(state)
+        if balance is None:
             return problem.shown(forward, None), None, rest
         forces: LawForces | None
         if problem.process_noise:
-            known = np.column_stack(forward.start_force)
-            forces = loop.answer(march_on(forward, state, self.split) if number else known)
+            known = np.column_stack(forward.warm_start)
+            forces = balance.solution(march_from(forward, state, self.split) if number else known)
         else:
             forces = forward.law_forces(state, _SETTLED)
             assert forces is not None
@@ -214,8 +214,8 @@ class HeldOut:
                 if number < _MARCHED:
                     force, rest = march_from_rest(forward, state + rest)
                 else:
-                    force = np.column_stack(forward.start_force)
-                forces = loop.answer(force)
+                    force = np.column_stack(forward.warm_start)
+                forces = balance.solution(force)
         return problem.shown(forward, forces), forces, rest
 
     def _judged(self, simulated: FloatArray, point: Point) -> FreeRun:

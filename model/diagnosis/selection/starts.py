@@ -11,7 +11,7 @@ from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import opened
 from sprung.model.diagnosis.response.point import Point, advance, fixed
-from sprung.model.diagnosis.response.terms import Term, branches_of, is_waveform
+from sprung.model.diagnosis.response.terms import Term, branches_of, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
 from sprung.model.laws.base import FittedElement, Restart
@@ -46,7 +46,7 @@ def start_of(base: Fit, candidate: Candidate) -> Point:
     more = branches_of(candidate.term, base.forward.system, base.forward.plant.structure)
     state = np.pad(state, (0, len(more)))  # their forces
     near = point.warm_start
-    if is_waveform(candidate.term):
+    if evaluated_in_time(candidate.term):
         near = (*near, base.force_along(candidate.term))
     return Point(point.theta, (*point.terms, candidate.term), state, near)
 

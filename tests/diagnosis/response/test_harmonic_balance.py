@@ -40,12 +40,12 @@ def test_a_stop_that_is_hit_all_the_time_is_solved_by_newtons_steps() -> None:
     stop = Term(find_law("bump_stop"), "secondary", (2e-3, 1.45e6), scales=(1e-3, 5e5))
     point = Point(np.zeros(len(PROBLEM.system.parameters)), (stop,), np.zeros(4))
     forward = PROBLEM.forward(point)
-    loop = forward.loop(point.state)
-    hasty = replace(forward, patient=False).law_forces(point.state)
+    balance = forward.harmonic_balance(point.state)
+    hasty = replace(forward, newton_allowed=False).law_forces(point.state)
     assert hasty is not None and not hasty.converged
     forces = forward.law_forces(point.state)
-    assert loop is not None and forces is not None and forces.converged
-    expected = loop.law(forces.deflection, forces.rate)
+    assert balance is not None and forces is not None and forces.converged
+    expected = balance.law_forces(forces.deflection, forces.rate)
     np.testing.assert_allclose(forces.force, expected, atol=1e-4 * np.max(np.abs(expected)))
 
 

@@ -22,10 +22,10 @@ def test_forces_marched_in_time_are_those_of_the_whole_trajectory(
     problem = problem_of(simulate(seed=6))
     point = Point(true_log_ratios(quarter_car()), (Term(find_law(law), "secondary", values),), np.zeros(4))
     forward = problem.forward(point)
-    alone = replace(forward, patient=False).law_forces(point.state)
+    alone = replace(forward, newton_allowed=False).law_forces(point.state)
     assert alone is not None and alone.converged is settles
     marched, rest = march_from_rest(forward, point.state)
-    led = replace(forward, start_force=tuple(marched.T)).law_forces(point.state - rest)
+    led = replace(forward, warm_start=tuple(marched.T)).law_forces(point.state - rest)
     assert led is not None and led.converged
     difference = marched - led.force
     assert np.std(difference) < 0.02 * np.std(led.force)
