@@ -173,9 +173,9 @@ def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules)
     ranked = []
     for fit in fits:
         gain = level_gain(before.error, fit.error, count)
-        dear = (fit.model.count - before.model.count) * float(np.log(count)) if count > 1 else 0.0
-        dear += rules.plain_cost * sum(piece.plain for piece in fit.model.pieces)
-        ranked.append(Ranked(fit, gain, gain - dear, count))
+        cost = (fit.model.count - before.model.count) * float(np.log(count)) if count > 1 else 0.0
+        cost += rules.plain_cost * sum(piece.plain for piece in fit.model.pieces)
+        ranked.append(Ranked(fit, gain, gain - cost, count))
     return sorted(ranked, key=lambda r: -r.evidence)
 
 
@@ -266,10 +266,48 @@ def _determined(fit: ComponentFit, *, by_all: bool = False) -> bool:
     return all(told)
 
 
-def _told_instead(ranked: list[Ranked]) -> list[Ranked]:
-    """Of laws whose force the record tells, best first, the first that leaves hardly more than the very best.
+def _accepted(
+    current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: ComponentRules, tests: int
+) -> Step | None:
+    """The next law, if one is significant, improves the held-out part and removes enough of the error.
 
-    Where that leaves more than noise it is not quite what is there, and fits better because it may be many things.
+    current: the model so far; ranked: models with one more law, best first; base: the model with the given laws alone.
+    """
+    near = _near_best(ranked, rules)
+    if not near:
+        return None
+    determined = [r for r in near if _determined(r.fit)] or _determined_rival(ranked)
+    alone = len(current.fit.model.pieces) == len(base.model.pieces)
+    near = _without_doubtful_lags(determined or near, current.fit, alone, rules)
+    if not near and (not alone or current.fit.leaves_more):  # else a mere delay within the noise: no law in its place
+        near = [r for r in ranked if not isinstance(r.last, Lag) and r.evidence > 0][:1]
+    if not near:
+        return None
+    chosen = _plainest(near, rules)
+    rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
+    forms = tuple(r for r in ranked if r is not chosen and r.last.effect == chosen.last.effect)
+    p_value = chance(chosen.gain, chosen.fit.model.count - current.fit.model.count, tests)
+    if p_value > rules.alpha or chosen.fit.held_out >= current.fit.held_out:
+        return None
+    if alone and not current.fit.leaves_more and not _determined(chosen.fit, by_all=True):
+        return None  # where all may be noise, the law's value must be certain
+    if current.fit.model.pieces and not (determined and _removes_enough(chosen.fit, current.fit, base, rules)):
+        return None
+    return Step(chosen, current, rivals, p_value, forms)
+
+
+def _near_best(ranked: list[Ranked], rules: ComponentRules) -> list[Ranked]:
+    """Models within the naming margin of the best one, and all that leave nothing but noise."""
+    if not ranked:
+        return []
+    least = max(0.0, ranked[0].evidence - rules.naming_margin)
+    return [r for r in ranked if r.evidence > least or (r.evidence > 0 and r.fit.at_noise)]
+
+
+def _determined_rival(ranked: list[Ranked]) -> list[Ranked]:
+    """The first model, best first, with a determined law that leaves hardly more error than the best model.
+
+    Only where the best model leaves more than noise: it then is not the true one, but more flexible.
     """
     best = ranked[0].fit
     if not best.leaves_more:
@@ -278,49 +316,26 @@ def _told_instead(ranked: list[Ranked]) -> list[Ranked]:
     return list(islice(close, 1))
 
 
-def _accepted(
-    current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: ComponentRules, tests: int
-) -> Step | None:
-    """The next law, if there is one that is no chance, serves the held-out part and removes enough."""
-    near = [
-        r
-        for r in ranked
-        if r.evidence > max(0.0, ranked[0].evidence - rules.naming_margin) or (r.evidence > 0 and r.fit.at_noise)
-    ]
-    if not near:
-        return None
-    # a law whose force the record does not tell is no name; what else it does not tell apart, the held-out part may
-    told = [r for r in near if _determined(r.fit)] or _told_instead(ranked)
-    near = told or near
-    # beside a valve or a loop a lag is as well oil or rubber that gives way, unless next to nothing is left with it
-    alone = len(current.fit.model.pieces) == len(base.model.pieces)
+def _without_doubtful_lags(
+    near: list[Ranked], before: ComponentFit, alone: bool, rules: ComponentRules
+) -> list[Ranked]:
+    """Models without lags of the force's channel that may be physics.
+
+    Beside a valve or hysteresis a lag may be compliance of oil or rubber, and a filter always is, since oil behind
+    valves filters their force likewise.  alone: whether no law was found so far.
+    """
     most = 1 - rules.by_lag if alone else rules.together
-    # and never a filter: oil behind valves filters their force likewise
-    near = [
+    return [
         r
         for r in near
-        if not isinstance(r.last, Lag) or ((alone or not r.last.filters) and _leaves_nothing(r.fit, current.fit, most))
+        if not isinstance(r.last, Lag) or ((alone or not r.last.filters) and _leaves_nothing(r.fit, before, most))
     ]
-    if not near and alone and not current.fit.leaves_more:
-        return None  # nothing but a channel's delay within what noise leaves open: no law in its place
-    if not near:
-        near = [r for r in ranked if not isinstance(r.last, Lag) and r.evidence > 0][:1]
-    if not near:
-        return None
-    chosen, before = _plainest(near, rules), current
-    rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
-    forms = tuple(r for r in ranked if r is not chosen and r.last.effect == chosen.last.effect)
-    freedom = chosen.fit.model.count - before.fit.model.count
-    p_value = chance(chosen.gain, freedom, tests)
-    if p_value > rules.alpha or chosen.fit.held_out >= before.fit.held_out:
-        return None
-    if alone and not before.fit.leaves_more and not _determined(chosen.fit, by_all=True):
-        return None  # within what may be noise, only a law that is sure counts
-    if len(before.fit.model.pieces) > 0:
-        removed = before.fit.held_out - chosen.fit.held_out
-        if not told or removed < max(rules.least_share * before.fit.held_out, rules.minor * base.held_out):
-            return None
-    return Step(chosen, before, rivals, p_value, forms)
+
+
+def _removes_enough(fit: ComponentFit, before: ComponentFit, base: ComponentFit, rules: ComponentRules) -> bool:
+    """Whether a further law removes enough of the held-out error."""
+    removed = before.held_out - fit.held_out
+    return removed >= max(rules.least_share * before.held_out, rules.minor * base.held_out)
 
 
 def _plainest(near: list[Ranked], rules: ComponentRules) -> Ranked:

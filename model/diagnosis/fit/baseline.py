@@ -1,4 +1,4 @@
-"""The nominal structure identified on a recording, with noise levels estimated on the way."""
+"""Identification of the nominal structure on a recording, including noise levels."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-_STRETCHES, _FEWEST, _STEPS = (16, 8, 4, 2), 60, 8  # shares of a free decay that are fitted first; samples; iterations
-_REFITS, _SETTLED = 12, 0.05  # of force noise and fit, which weighs by it; change of the level
-_ROUNDS, _MORE = 5, 10  # of a fit that still falls, and its iterations
+_STRETCHES, _FEWEST, _STEPS = (16, 8, 4, 2), 60, 8  # divisors of a free decay fitted first; least samples; iterations
+_REFITS, _SETTLED = 12, 0.05  # alternations of fit and force noise; relative change of the level at convergence
+_ROUNDS, _MORE = 5, 10  # restarts of an unconverged fit, and their iterations
 _DIVERGED = (
-    "the system file's structure cannot be fitted to this recording: the numbers diverge; "
+    "the structure of the system file cannot be fitted to this recording: the estimates diverge; "
     "check units, signs and order of the channels, and the masses and stiffnesses of the system file"
 )
 
@@ -42,13 +42,13 @@ def baseline(
     *,
     roughly: bool = False,
 ) -> tuple[Problem, Fit]:
-    """The system of the file, its laws included, on the first `split` samples; noise levels estimated on the way.
+    """The system file's model, laws included, fitted to the first `split` samples with estimated noise levels.
 
-    roughly: with the noise of measured forces as their whole misfit suggests, which is where every fit begins.
-    Errors: `DiagnosisError` where the numbers of system file and recording fit each other so badly that none comes out.
+    roughly: without refining the noise of measured forces that the initial misfit suggests.
+    Errors: `DiagnosisError` if the fit diverges, since system file and recording contradict each other.
     """
     try:
-        with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
+        with np.errstate(all="ignore"):  # diverging fits are recognised by their chi-square
             problem, fit = _begun(system, signals, declared, split, rules, memory, work)
             if not roughly:
                 problem, fit = refreshed(problem, fit)
@@ -76,7 +76,7 @@ def _begun(
     start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(0))
     start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
     if len(noise.force):
-        # far from the truth a lightly damped system fits no better in any direction: their noise accounts for it
+        # far from the optimum of a lightly damped system there is no descent; force noise then accounts for the misfit
         lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), noise)))
         problem = replace(problem, noise=force_noise(lin.forward, lin.spectrum, noise, rules.noise))
     if not system.file.inputs:
@@ -85,9 +85,9 @@ def _begun(
 
 
 def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, start: Point) -> FloatArray:
-    """Parameters of a free decay, (P,): from its first periods, then of stretches twice as long each time.
+    """Parameters of a free decay, (P,): from its first periods, then from segments of doubled length.
 
-    Frequencies that differ by more than the inverse of a stretch leave no way downhill from one to the other.
+    The objective has local minima where frequencies differ by more than the inverse length of a segment.
     """
     theta = start.theta
     for share in _STRETCHES:
@@ -102,7 +102,7 @@ def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, sta
 
 
 def settled(problem: Problem, fit: Fit) -> Fit:
-    """A fit that still falls, fitted on: what a misfit leaves when steps run out passes for another finding."""
+    """An unconverged fit, continued: the misfit of an unconverged fit looks like a further finding."""
     for _ in range(_ROUNDS):
         if fit.converged:
             break
@@ -114,10 +114,10 @@ def settled(problem: Problem, fit: Fit) -> Fit:
 
 
 def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
-    """Noise levels and whitening at a fit, and the fit again.
+    """Noise levels and whitening estimated at a fit, and the fit repeated with them.
 
-    Sensors come after the forces: beside a force that is still taken for far too noisy, a sensor seems to have no
-    noise of its own, and then the force has to answer for that of the sensor.
+    Levels of forces come before those of sensors: beside an overestimated force noise, sensors seem to have no noise
+    of their own.
     """
     settled = 0
     for _ in range(_REFITS):

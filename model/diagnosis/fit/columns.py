@@ -12,7 +12,7 @@ from sprung.model.signals import FloatArray
 
 
 class JacobianColumns:
-    """The jacobian, column by column in whitened real numbers, stored so that every column is contiguous."""
+    """The Jacobian as whitened real numbers, each column contiguous in memory."""
 
     def __init__(self, forward: Forward, whitener: Whitener, count: int) -> None:
         grid = forward.part.grid
@@ -55,7 +55,7 @@ class JacobianColumns:
         self._add(column, self.of_force[element] * force[self.band, None])
 
     def _add_polynomial(self, column: int, motion: FloatArray) -> None:
-        """What the sensors show of a polynomial motion."""
+        """Shown sensor signals of a polynomial motion."""
         plant = self.forward.plant
         still = np.zeros((motion.shape[0], plant.structure.G.shape[1]))
         seen = plant.grid.monomial_spectra @ plant.polynomial_sensors(motion, still)

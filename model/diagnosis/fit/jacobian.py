@@ -1,4 +1,4 @@
-"""What every free value does to the residual: the jacobian of a fit, laws' answers included."""
+"""Jacobian of a fit: sensitivities of the residual to all free values, with the reaction of the laws."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from sprung.model.signals import FloatArray
 
 @dataclass(frozen=True)
 class Change:
-    """What one more of a parameter does."""
+    """Derivatives by one parameter."""
 
-    shown: ComplexArray  # to the sensors, (F, S)
-    log_det: float = 0.0  # to the residual's covariance
-    motion: FloatArray | None = None  # to deflection and rate along the laws' ports, forces held, (2, N, m)
+    shown: ComplexArray  # of the shown sensor signals, (F, S)
+    log_det: float = 0.0  # of the log determinant of the residual's covariance
+    motion: FloatArray | None = None  # of deflection and rate along the laws' ports at constant forces, (2, N, m)
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residual at a point, and its sensitivities once somebody asks for them: a step that fails needs none."""
+    """Residual at a point, with sensitivities computed on demand: rejected steps need none."""
 
     problem: Problem
     point: Point
     working: Working
     forward: Forward
     forces: LawForces | None
-    shown: ComplexArray  # by the sensors but for the free motion, (F, S)
+    shown: ComplexArray  # sensor signals without the free motion, (F, S)
     free: ComplexArray  # motion per state at the first sample, (F, S, 2n)
 
     @cached_property
@@ -63,7 +63,7 @@ class Linearised:
 
     @cached_property
     def motions(self) -> Motions:
-        """Of everything, along the residual's own inputs."""
+        """Total motion under the inputs of the residual."""
         return motions_of(self.forward, self.forces, self.point.state)
 
     @property
@@ -94,14 +94,16 @@ class Linearised:
 
 @dataclass
 class _Sensitivities:
-    """Sensitivities to theta and the terms' parameters, column by column, while they are put together."""
+    """Sensitivities to theta and the terms' parameters, assembled column by column."""
 
     packed: JacobianColumns
     theta_forces: ComplexArray  # along the parameters' elements, (F, P)
-    loads: dict[int, ComplexArray]  # on the degrees of freedom, (F, n), of the columns that push bodies
+    loads: dict[int, ComplexArray]  # on the degrees of freedom, (F, n), by column
     law_forces: ComplexArray  # of the laws by their own parameters, (F, p, m)
     log_det: FloatArray  # (P + p,)
-    shifts: dict[int, FloatArray] = field(default_factory=dict)  # motion along ports, of what moves it by itself
+    shifts: dict[int, FloatArray] = field(
+        default_factory=dict
+    )  # motion along ports, (2, N, m), by column, of terms that move bodies directly
 
 
 def linearise(problem: Problem, point: Point, working: Working) -> Linearised:
@@ -115,7 +117,7 @@ def linearise(problem: Problem, point: Point, working: Working) -> Linearised:
 def _of_theta(
     problem: Problem, forward: Forward, forces: LawForces | None, whitener: Whitener, motions: Motions, point: Point
 ) -> _Sensitivities:
-    """Room for all columns, those of theta filled in."""
+    """All columns, of which those of theta are set."""
     P, p = len(point.theta), sum(len(t.parameters) for t in point.terms)
     theta_forces, loads = _theta_forces(forward, motions)
     packed = JacobianColumns(forward, whitener, P + p + len(point.state))
@@ -141,7 +143,7 @@ def _add_terms(
     forces: LawForces | None,
     shown: ComplexArray,
 ) -> None:
-    """Columns of the terms' parameters, laws' answers left out."""
+    """Columns of the terms' parameters, without the reaction of the laws."""
     at = P = len(point.theta)
     measured = forward.with_part(problem.part)
     for index, term in enumerate(point.terms):
@@ -168,7 +170,7 @@ def _add_terms(
 def _add_laws_answers(
     known: _Sensitivities, problem: Problem, whitener: Whitener, forward: Forward, forces: LawForces, states: int
 ) -> None:
-    """What the laws along the trajectory answer to the motion that every column is."""
+    """Adds the reaction of the laws to the motion of every column."""
     along = port_motions(forward, forces, known.theta_forces, known.loads, known.law_forces, states)
     for column, motion in known.shifts.items():
         along[..., column] = motion
@@ -182,7 +184,7 @@ def _add_laws_answers(
 
 
 def _theta_forces(forward: Forward, motions: Motions) -> tuple[ComplexArray, dict[int, ComplexArray]]:
-    """Forces along the own element that act like a rise of log k (log c): (F, P); loads (F, n) of log masses."""
+    """Forces along an element equivalent to d/d log k (log c), (F, P), and loads (F, n) equivalent to d/d log mass."""
     omega, structure = forward.plant.grid.omega, forward.plant.structure
     forces = np.zeros((len(omega), len(forward.system.parameters)), dtype=complex)
     loads = {}
@@ -212,9 +214,9 @@ def _difference(
     forces: LawForces | None,
     shown: ComplexArray,
 ) -> Change:
-    """What one more of a term's parameter (`which`: term, parameter) does, by a finite difference of the model.
+    """Derivatives by a term's parameter (`which`: term, parameter), by a finite difference of the model.
 
-    Forces along a smoothed motion are held: how they answer is the tangent's matter.
+    Forces along a smoothed motion are held constant; their reaction is computed by `tangent`.
     """
     index, parameter = which
     term = point.terms[index]
@@ -222,7 +224,9 @@ def _difference(
     moved = term.moved(parameter, step)
     terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
     elsewhere = replace(point, terms=terms, warm_start=warm_start_of(forces))
-    if term.location in problem.system.sensors and isinstance(term.law, SensorLaw):  # what it shows moves nothing
+    if term.location in problem.system.sensors and isinstance(
+        term.law, SensorLaw
+    ):  # sensor faults have no effect on the motion
         other_forward, other_forces = problem.forward(elsewhere, working.inputs, forward.plant), forces
         other = problem.shown(other_forward, forces)
     else:
@@ -240,7 +244,7 @@ def _difference(
 
 
 def _log_det_slopes(forward: Forward, whitener: Whitener) -> FloatArray:
-    """Rise of the residual's log determinant with every log-ratio, (P,): inputs' noise goes through the plant."""
+    """Derivative of the residual's log determinant by the log-ratios, (P,): input noise passes the plant."""
     plant, band = forward.plant, forward.part.grid.band
     jw = 1j * plant.grid.omega[band, None]
     shown = forward.sensor_factor[band, :, None]

@@ -1,6 +1,6 @@
-"""Equivalent linearisation of laws: the plant carries it, so that only the curvature is left to the iteration.
+"""Equivalent linearisation of laws: it becomes part of the plant, so that only the curvature is iterated.
 
-The stiffness and damping nearest to the law's force along its motion in least squares (statistical
+Stiffness and damping that approximate the law's force along its motion in least squares (statistical
 linearisation, Roberts and Spanos 2003; for one harmonic the describing function).
 """
 
@@ -20,17 +20,17 @@ from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.signals import FloatArray
 
-_ROUNDS = 4  # of equivalent law and motion
+_ROUNDS = 4  # alternations of equivalent and motion
 _SETTLED = 1e-3  # largest change of an equivalent stiffness or damping, as a share of it and the element's
-_ROUGH = 1e-3  # of the laws' forces, along which an equivalent is read
-_NEAR = 0.2  # the same where the balance converges anyway
+_ROUGH = 1e-3  # relative tolerance of the forces from which an equivalent is computed
+_NEAR = 0.2  # the same, if the harmonic balance converges anyway
 
 
 def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | None) -> Point:
     """The point with the laws' equivalent stiffness and damping moved into the plant.
 
-    The equivalent depends on the motion that the law shapes, so the two are iterated until the balance converges; a
-    motion that follows the sensors stays as it is.
+    The equivalent depends on the motion, which depends on the law: both are iterated until the harmonic balance
+    converges.  A smoothed motion is kept.
     """
     if not any(_carried(term) for term in point.terms):
         return point
@@ -44,7 +44,7 @@ def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | No
         point = replace(point, terms=terms, warm_start=tuple(force.T))
         if change < _SETTLED or problem.process_noise:
             break
-        # the free state counts from the plant's particular solution, which has changed: keep motion and true state
+        # the particular solution of the plant has changed: the free state is shifted so that the total state stays
         moved = problem.forward(point, inputs)
         balance = moved.harmonic_balance(point.state)
         if balance is not None:
@@ -55,7 +55,7 @@ def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | No
 
 
 def _carried(term: Term) -> bool:
-    """Whether the plant can carry a law's equivalent: that of a pair couples two elements, which no element does."""
+    """Whether a law's equivalent can be part of the plant; that of a pair would couple two elements."""
     return evaluated_in_time(term) and "|" not in term.location
 
 
@@ -88,7 +88,7 @@ def _equivalent(forward: Forward, forces: LawForces, term: Term) -> tuple[float,
     inside = np.all(np.abs(regressors) < reach, axis=1)
     k, c = np.linalg.lstsq(regressors[inside] / sizes, f[inside], rcond=None)[0] / sizes
     element = forward.element_of(term)
-    k = max(k, -0.9 * element.stiffness) if element.stiffness else 0.0  # a body that floats stays afloat
+    k = max(k, -0.9 * element.stiffness) if element.stiffness else 0.0  # unconstrained bodies stay unconstrained
     c = max(c, -0.9 * element.damping) if element.damping else max(c, 0.0)
     if not forces.converged:
         k, c = (k + term.equivalent[0]) / 2, (c + term.equivalent[1]) / 2

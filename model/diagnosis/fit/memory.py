@@ -1,4 +1,4 @@
-"""Fits that are known already, for those who diagnose one recording again under other rules."""
+"""Cache of fits, for repeated diagnoses of one recording under other rules."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ Known = TypeVar("Known")
 
 
 class FitMemory:
-    """Results by what goes into them, the recording and the start by value.  May be shared among threads.
+    """Results by their arguments, recording and start by value.  Thread-safe.
 
-    A result that two threads ask for at once is made twice; they are alike.
+    Concurrent requests for one result may compute it twice; the results are equal.
     """
 
     def __init__(self) -> None:
         self._known: dict[object, Any] = {}
 
     def recall(self, key: object, make: Callable[[], Known]) -> Known:
-        """The result of a key, made where it is not known yet."""
+        """The result of a key, computed if it is not cached."""
         if key not in self._known:
             self._known[key] = make()
         known: Known = self._known[key]
@@ -33,7 +33,7 @@ class FitMemory:
 
 
 def key_of(system: System, part: Part, noise: Noise, start: Point, *others: object) -> bytes:
-    """A key for a fit; `others`: what else goes into it, arrays or plain values."""
+    """A key for a fit; `others`: further arguments, arrays or plain values."""
     digest = hashlib.blake2b(digest_size=16)
     arrays = [*system.mechanics.matrices(), part.sensors, part.support, part.force]
     arrays += [noise.sensors, noise.displacement, noise.velocity, noise.force]

@@ -1,11 +1,11 @@
-"""Noise levels, estimated: of inputs from their redundancy, of sensors from what neither model nor neighbours explain.
+"""Estimation of noise levels: of inputs from analytical redundancy, of sensors from their own part of the residual.
 
-A measured force has no second measurement, and between it and the body lies what nobody measured: the drive's ripple,
-friction in the transmission, the amplifier.  Its noise is estimated from the residual; through the plant it gives the
-residual of a real record its colour.
+A measured force has no redundant measurement, and unmeasured effects lie between it and the body: ripple of the drive,
+friction in the transmission, the amplifier.  Its noise level is estimated from the residual, which it colours through
+the plant.
 
-Physics that was left out is concentrated in some bands and sensors, noise is white: the level of a sensor is the
-median over frequency blocks, so that the misfit of a missing law does not pass for noise.
+Unmodelled dynamics is concentrated in some bands and sensors, noise is white: the level of a sensor is the median over
+frequency blocks, so that the misfit of a missing law is not taken for noise.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ROUNDS = 4
 def input_noise(part: Part, noise: Noise) -> Noise:
     """Levels of displacement and velocity channels from V / j w - D, by Fisher scoring per support.
 
-    What of the difference is a copy of the motion or of its derivative (a wrong gain, a lag) is taken out first.
+    The part of the difference proportional to the motion or its derivative (gain error, lag) is removed first.
     """
     band = part.grid.band
     omega = part.grid.omega[band]
@@ -70,7 +70,7 @@ def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise, rules: 
 
 
 def _level(normalised: FloatArray, share: FloatArray, rules: NoiseRules) -> float:
-    """Ratio of a sensor's noise power to the supposed one, from the bins (F,) where its own noise counts."""
+    """Ratio of a sensor's noise power to the assumed one, from the bins (F,) with a significant share of own noise."""
     own = share > rules.own
     if np.sum(own) < 2 * rules.blocks:
         return 1.0
@@ -98,7 +98,7 @@ def force_noise(forward: Forward, spectrum: ComplexArray, noise: Noise, rules: N
 
 
 def _robust(blocks: FloatArray, counts: np.ndarray) -> float:
-    """Level over blocks, (blocks,): the mean of those that agree with the quiet half."""
+    """Robust level over blocks, (blocks,): the mean of those that agree with the quieter half."""
     middle, quiet = np.median(blocks), np.quantile(blocks, 0.3)
     spread = 1 / np.sqrt(np.mean(counts))
     base = min(middle, quiet * (1 + 2 * spread))

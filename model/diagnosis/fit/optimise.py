@@ -1,12 +1,11 @@
-"""Maximum likelihood of parameters, terms and starting state on one part of a recording.
+"""Maximum likelihood estimation of parameters, terms and initial state on one part of a recording.
 
 Minimising r^H R^-1 r (`problem`) over the parameters is the functional maximum likelihood of an errors-in-variables
 model, the true inputs being profiled out: u = u_m + S_u G^H R^-1 r.  Gauss-Newton with the sensitivities taken at that
 smoothed input is free of the attenuation bias that noisy regressors cause (Soderstrom 2007).
 
-A measured force is another matter: between it and the body lies what nobody measured, so its "noise" really pushes
-the body.  Then the likelihood is that of a system with process noise, r^H R^-1 r + log det R (Astrom 1980), and laws
-act along the motion that the sensors saw.
+The "noise" of a measured force, in contrast, acts on the body: it comprises unmeasured forces.  The likelihood is then
+that of a system with process noise, r^H R^-1 r + log det R (Astrom 1980), and laws act along the measured motion.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class Fit:
     log_det: float  # of the residual's covariance
     log_det_slope: FloatArray  # by theta and term parameters (internal scale), (P + p,)
     noise: Noise
-    whitener: Whitener  # that weighs the residual
+    whitener: Whitener  # of the residual
     count: int  # real residuals
     covariance: FloatArray  # of theta and the term parameters, (P + p, P + p)
     residual: FloatArray  # whitened, (R,)
@@ -58,24 +57,24 @@ class Fit:
     forward: Forward
     forces: LawForces | None
     motions: Motions
-    left: float  # by how much the objective fell in the last step, or would in a step that failed
+    left: float  # decrease of the objective in the last step, or predicted for a rejected one
     iterations: int
-    bounded: bool = False  # a law's parameter stopped at its bound
+    bounded: bool = False  # whether a law's parameter is at a bound
 
     def place(self, index: int) -> slice:
-        """Where the parameters of a term stand in the covariance."""
+        """Position of a term's parameters in the covariance."""
         counts = [len(term.parameters) for term in self.point.terms]
         first = len(self.point.theta) + sum(counts[:index])
         return slice(first, first + counts[index])
 
     @property
     def converged(self) -> bool:
-        """Whether another step would change nothing that matters."""
+        """Whether the last decrease of the objective is too small to matter."""
         return self.left < _UNSETTLED * self.grain
 
     @property
     def grain(self) -> float:
-        """Fall of the objective that is worth one of evidence, which counts ratios where more than noise is left."""
+        """Decrease of the objective equivalent to one unit of evidence, which counts ratios above the noise."""
         return 1.0 if self.noise.process_noise else max(1.0, self.reduced)
 
     @property
@@ -114,7 +113,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class _State:
-    """Where the optimiser stands."""
+    """State of the optimiser."""
 
     point: Point
     working: Working
@@ -123,7 +122,7 @@ class _State:
 
 
 def try_optimise(problem: Problem, start: Point, iterations: int, whitener: Whitener | None = None) -> Fit | None:
-    """A fit that may diverge: None where it does, or where no work is left for it."""
+    """As `optimise`; None if the fit diverges or the budget of work is exhausted."""
     if problem.worked_out:
         return None
     try:
@@ -141,11 +140,11 @@ def optimise(
     tolerance: float = 1e-3,
     whitener: Whitener | None = None,
 ) -> Fit:
-    """Gauss-Newton with Levenberg damping from `start`; stops when no parameter moves by `tolerance` std.
+    """Gauss-Newton with Levenberg-Marquardt damping; stops when no parameter moves by `tolerance` std.
 
-    The fit is the best point seen: a step that raises the objective is never taken.  Since inputs are smoothed anew
-    and loops solved again in every step, a rise counts only against the present point under the same new inputs.
-    `whitener`: that of a fit whose chi-square this one is compared with; by default, of the model at the start.
+    The fit is the best point evaluated: steps that raise the objective are rejected.  As every step smooths the
+    inputs and solves the harmonic balance anew, steps are compared with the present point under the same new inputs.
+    `whitener`: of the fit whose chi-square this one is compared with; by default of the model at the start.
     """
     if problem.memory is None:
         return _optimised(problem, start, iterations, tolerance, whitener)
@@ -197,14 +196,14 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
 
 
 def _grain(problem: Problem, state: _State) -> float:
-    """Fall of the objective that matters: of a misfit that is no noise, a share."""
+    """Decrease of the objective that matters: a share of it where the misfit exceeds noise."""
     rows, columns = state.lin.jacobian.shape
     chi_square = float(state.lin.residual @ state.lin.residual)
     return 1.0 if problem.process_noise else max(1.0, chi_square / max(1, rows - columns))
 
 
 def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[Point, Working]:
-    """The start with its laws' equivalents in the plant, and what its residual is weighed by."""
+    """The start with its laws' equivalents in the plant, and the weights of its residual."""
     if problem.process_noise:
         point, working = along_measured_motion(problem, start)
         return along_measured_motion(problem, with_equivalents(problem, point, working.inputs))
@@ -219,10 +218,10 @@ def _state(problem: Problem, point: Point, working: Working) -> _State:
 
 
 def _begun_anew(problem: Problem, state: _State) -> _State:
-    """A free decay with the starting state that suits its parameters (variable projection, Golub and Pereyra 1973).
+    """A free decay with the optimal initial state for its parameters (variable projection, Golub and Pereyra 1973).
 
-    Joint steps of both only creep, since parameters act on the motion of the former starting state; and from rest,
-    where they do not act at all, they would go to where the prior is.
+    Joint steps converge slowly, since parameters act on the motion of the previous initial state; from rest, where
+    they have no effect, they would converge to the prior.
     """
     columns = state.lin.jacobian[:, -len(state.point.state) :]
     if not (np.isfinite(columns).all() and np.isfinite(state.lin.residual).all()):
@@ -237,7 +236,7 @@ def _value(problem: Problem, residual: FloatArray, log_det: float, point: Point)
 
 
 def _prior_residual(problem: Problem, point: Point) -> tuple[FloatArray, FloatArray]:
-    """Distance of theta and the terms' parameters from what is expected, in deviations, and one over these."""
+    """Prior residuals of theta and the terms' parameters, in standard deviations, and their weights, each (P + p,)."""
     prior = problem.rules.fit.prior
     away, sharp = [point.theta / prior], [np.full(len(point.theta), 1 / prior)]
     for term in point.terms:
@@ -247,7 +246,7 @@ def _prior_residual(problem: Problem, point: Point) -> tuple[FloatArray, FloatAr
 
 
 def _value_under(problem: Problem, state: _State, working: Working) -> float:
-    """The objective at the present point under inputs that were smoothed anew."""
+    """The objective at the present point under newly smoothed inputs."""
     inputs, point = working.inputs, state.point
     if inputs is None:
         return state.value
@@ -259,7 +258,7 @@ def _value_under(problem: Problem, state: _State, working: Working) -> float:
 
 
 def information(problem: Problem, fit: Fit) -> FloatArray:
-    """What a fit tells of theta, the terms' parameters (internal scale) and the state, with what is expected."""
+    """Information matrix of theta, the terms' parameters (internal scale) and the state, priors included."""
     return _with_expected(problem, fit.point, fit.jacobian.T @ fit.jacobian)
 
 
@@ -271,14 +270,14 @@ def _with_expected(problem: Problem, point: Point, gram: FloatArray) -> FloatArr
 
 
 def _normal(problem: Problem, lin: Linearised, point: Point) -> tuple[FloatArray, FloatArray]:
-    """Matrix of the normal equations with what is expected, columns scaled, and the scales."""
+    """Scaled matrix of the normal equations, priors included, and the scales."""
     normal = _with_expected(problem, point, lin.gram)
     scale = scale_of(normal, len(point.state))
     return normal * scale * scale[:, None], scale
 
 
 def _step(problem: Problem, lin: Linearised, point: Point, damping: float) -> tuple[FloatArray, FloatArray, float]:
-    """Gauss-Newton step, standard deviations of theta and term parameters, and the fall that a full step promises."""
+    """Gauss-Newton step, standard deviations of theta and term parameters, and the predicted decrease."""
     scaled, scale = _normal(problem, lin, point)
     gradient = lin.jacobian.T @ lin.residual
     gradient[: len(lin.log_det_slope)] -= lin.log_det_slope / 2
@@ -286,7 +285,7 @@ def _step(problem: Problem, lin: Linearised, point: Point, damping: float) -> tu
     gradient[: len(sharp)] -= away * sharp
     step, variance, promised = _solved(scaled, scale, gradient, damping)
     held = at_active_bounds(point, step)
-    if held.any():  # the others go on as if it were given
+    if held.any():  # the step of the others at constant held values
         scaled[held], scaled[:, held], gradient[held] = 0.0, 0.0, 0.0
         step, variance, promised = _solved(scaled, scale, gradient, damping)
     free = len(scaled) - len(point.state)
@@ -296,7 +295,7 @@ def _step(problem: Problem, lin: Linearised, point: Point, damping: float) -> tu
 def _solved(
     scaled: FloatArray, scale: FloatArray, gradient: FloatArray, damping: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Solution of damped normal equations, its variances, and the fall of the objective with least damping."""
+    """Solution of the damped normal equations, its variances, and the predicted decrease with least damping."""
     values, vectors = np.linalg.eigh(scaled)
     values = np.maximum(values, 0.0)
     turned = vectors.T @ (gradient * scale)

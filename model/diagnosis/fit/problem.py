@@ -1,4 +1,4 @@
-"""What is fitted: one part of a recording, its noise, and what a model predicts of it.
+"""The estimation problem: one part of a recording, its noise, and the prediction of a model.
 
 Residual of bin w:   r = y - Y(theta, terms, x0; u),   covariance  R = diag(s^2) + G S_u G^H,
 
@@ -23,44 +23,44 @@ from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-_ROUND = 0.01  # of a linearisation of a vehicle, that a law's force along a motion and what it does take
+_ROUND = 0.01  # cost of one law evaluation, relative to the linearisation of a vehicle
 
 
 @dataclass(frozen=True)
 class SmoothedInputs:
-    """Inputs as the sensors ask for them within their noise."""
+    """Inputs corrected within their noise by the smoother."""
 
     part: Part
-    force: FloatArray | None = None  # of the laws along the motion that results, (4N, m)
+    force: FloatArray | None = None  # of the laws along the smoothed motion, (4N, m)
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One part of a recording with its noise, ready to be fitted."""
+    """One part of a recording with its noise, to be fitted."""
 
     system: System
     part: Part
     sensors: np.ndarray  # indices of the present sensors
     noise: Noise
-    rules: Rules = RULES  # by which fits to it are judged
-    memory: FitMemory | None = None  # fits that are known already
-    work: WorkBudget | None = None  # what fits may cost; None: any
-    newton_allowed: bool = True  # whether loops of laws and motion are solved however long that takes
+    rules: Rules = RULES  # of all decisions about fits
+    memory: FitMemory | None = None  # cache of fits
+    work: WorkBudget | None = None  # budget of work; None: unlimited
+    newton_allowed: bool = True  # whether Newton's method is tried where the harmonic balance does not converge
 
     @property
     def process_noise(self) -> bool:
-        """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
+        """Whether laws act along the smoothed motion, since unmeasured forces accompany a measured one."""
         return self.noise.process_noise
 
     @property
     def worked_out(self) -> bool:
-        """Whether the budget of work is spent: nothing more is tried."""
+        """Whether the budget of work is exhausted."""
         return self.work is not None and self.work.ended
 
     def forward(self, point: Point, inputs: SmoothedInputs | None = None, known: Plant | None = None) -> Forward:
         """The model at a point under the measured inputs, or under smoothed ones.
 
-        known: the plant of a model nearby, often the same.
+        known: plant of a nearby model, reused if equal.
         """
         part = self.part if inputs is None else inputs.part
         return Forward(
@@ -78,7 +78,7 @@ class Problem:
         return self.shown(forward, forces), forward, forces
 
     def shown(self, forward: Forward, forces: LawForces | None) -> ComplexArray:
-        """What the sensors show of a solution under the measured inputs, (F, S)."""
+        """Shown sensor signals of a solution under the measured inputs, (F, S)."""
         plant, part = forward.plant, forward.part
         periodic = forward.linear_sensors
         polynomial = plant.polynomial_sensors(forward.polynomial[0], forward.support_polynomial)
@@ -90,14 +90,14 @@ class Problem:
         return forward.shown(periodic, polynomial) + forward.of_body_loads()
 
     def shown_of_smoothed(self, forward: Forward, spectrum: ComplexArray) -> ComplexArray:
-        """What the sensors show of the smoothed motion, given the residual (F, S) of the measured inputs, (F, S)."""
+        """Shown sensor signals of the smoothed motion, (F, S), from the residual (F, S) under the measured inputs."""
         shown = self.part.sensors - spectrum
         if forward.part is self.part:
             return shown
         return shown - self._of_input_noise(forward) * forward.sensor_factor
 
     def _of_input_noise(self, forward: Forward) -> ComplexArray:
-        """What the linear plant makes of the measured inputs less the smoothed ones, (F, S)."""
+        """Linear response of the sensors to measured less smoothed inputs, (F, S)."""
         part, smoothed = self.part, forward.part
         forces = part.force - smoothed.force
         forces[0] += (part.force_polynomial - smoothed.force_polynomial)[0] * np.sqrt(part.grid.samples)
@@ -105,14 +105,14 @@ class Problem:
         return forward.plant.sensors(motion, forces / forward.force_faults[0])
 
     def free_columns(self, forward: Forward) -> ComplexArray:
-        """Transforms of what the sensors show of the free motion per state at the first sample, (F, S, 2n)."""
+        """Spectra of the shown free motion per state at the first sample, (F, S, 2n)."""
         return forward.plant.free_transforms(forward.free_rows_at_start())
 
 
 def law_forces(
     forward: Forward, point: Point, inputs: SmoothedInputs | None = None, tolerance: float = TOLERANCE
 ) -> LawForces | None:
-    """Forces of the laws: along the smoothed motion where they are known there, else of a free run."""
+    """Forces of the laws: along the smoothed motion if given, else of a free run."""
     if inputs is None or inputs.force is None:
         return forward.law_forces(point.state, tolerance)
     balance = forward.harmonic_balance(point.state)

@@ -1,6 +1,6 @@
-"""Inputs as the sensors ask for them within their noise, and laws along the motion that results.
+"""Smoothing of the inputs within their noise, with laws along the smoothed motion.
 
-What a step of the optimiser needs besides the point is one value, `Working`: it is made here, passed on and replaced.
+Beside the point, a step of the optimiser needs one value, `Working`: weights and smoothed inputs.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, La
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.signals import FloatArray
 
-_FOLLOWED = 1e-4  # of the laws' forces along a smoothed motion, which is no better known
+_FOLLOWED = 1e-4  # relative tolerance of the laws' forces along a smoothed motion
 _UNSEEN = 1e-26  # of the largest squared sensitivity to a state: rounding
 _WIDTH = 21  # bins over which the residual's level is averaged
 
 
 @dataclass(frozen=True)
 class Working:
-    """How residuals are weighed at a point, and the inputs that its model is driven by; None: as measured."""
+    """Weights of the residual at a point, and the inputs of its model; None: as measured."""
 
     whitener: Whitener
     inputs: SmoothedInputs | None = None
-    plant: Plant | None = None  # that inputs were smoothed through
+    plant: Plant | None = None  # of the smoother
 
 
 def opened(problem: Problem, point: Point, whitener: Whitener | None = None) -> tuple[Point, Working]:
-    """A point and what its residual is weighed by, before any residual is known."""
+    """A point and the weights of its residual, before the first evaluation."""
     if problem.process_noise:
         return along_measured_motion(problem, point)
     return point, Working(whitener or Whitener.of(problem.forward(point), problem.noise))
@@ -42,25 +42,24 @@ def opened(problem: Problem, point: Point, whitener: Whitener | None = None) -> 
 def smoothed(problem: Problem, point: Point, working: Working, spectrum: ComplexArray) -> tuple[Point, Working]:
     """Smooth the inputs at a point near the last one, whose residual was `spectrum` (F, S).
 
-    What of the residual the inputs' noise explains is taken for it.  Returns the point, where the system has measured
-    forces with its starting state fitted anew.
+    Returns the point and its weights; in systems with measured forces the initial state is fitted anew.
     """
     if problem.process_noise:
         return along_measured_motion(problem, point)
-    # the noise of supports is small: the last residual tells it well enough
+    # the noise of supports is small: the last residual is accurate enough
     return point, replace(working, inputs=SmoothedInputs(_smoothed(problem.part, working.whitener, spectrum)))
 
 
 def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Working]:
     """Smooth measured forces, with laws along the motion that results.
 
-    A measured force accounts for whatever else pushes the body, so its noise is large and the smoothed
-    motion is the one that the sensors saw, not a free run.  Laws' forces, state and smoothed inputs depend on each
-    other; they are iterated like the forces of a free run.
+    A measured force stands for all other forces on the body, so its noise is large, and the smoothed motion is close
+    to the measured one rather than a free run.  Laws' forces, state and smoothed inputs depend on each other and are
+    found by fixed-point iteration.
     """
     part = problem.part
     forward = problem.forward(replace(point, warm_start=()))
-    whitener = Whitener.of(forward, problem.noise)  # noise goes through the plant as it is now
+    whitener = Whitener.of(forward, problem.noise)  # of the present plant
     free = problem.free_columns(forward)
     columns = whitener(free, part)
     scale = scale_of(columns.T @ columns, columns.shape[1])
@@ -93,7 +92,7 @@ def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Workin
 
 
 def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
-    """The part with its inputs as a residual (F, S) asks for."""
+    """The part with inputs smoothed by a residual (F, S)."""
     band = part.grid.band
     whitened = (whitener.factor @ spectrum[band, :, None])[:, :, 0]
     size = np.mean(np.abs(whitened) ** 2, axis=1)
@@ -103,16 +102,19 @@ def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
     count = support.shape[1]
     support[band] += shift[:, :count] / np.maximum(1.0, local)[:, None]
     force[band] += shift[:, count:]
-    steady = part.force_polynomial.copy()  # moves a floating system steadily, which its spectrum cannot
+    steady = (
+        part.force_polynomial.copy()
+    )  # accelerates unconstrained systems steadily, which a spectrum cannot represent
     steady[0] += np.real(force[0] - part.force[0]) / np.sqrt(part.grid.samples)
     force[0] = part.force[0]
     return replace(part, support=support, force=force, force_polynomial=steady)
 
 
 def scale_of(normal: FloatArray, states: int) -> FloatArray:
-    """What brings the diagonal of normal equations to one; zero for what leaves no trace, which then stays as it is.
+    """Scales (p,) that make the diagonal of normal equations one; zero for unobservable values, which stay constant.
 
-    Where a body floats, its starting position, among the states at the end, leaves none in rates and accelerations.
+    The initial position of an unconstrained body, one of the `states` last values, is unobservable in rates and
+    accelerations.
     """
     size = np.diag(normal)
     seen = size > 0

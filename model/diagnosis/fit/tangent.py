@@ -1,4 +1,4 @@
-"""How laws along the trajectory answer small changes of it: sensitivities through the balance of laws and plant."""
+"""Tangent of the harmonic balance: sensitivities of laws and motion to small changes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def port_motions(
 ) -> FloatArray:
     """Deflection and rate along the laws' ports per unit of every free value, (2, N, m, columns).
 
-    What acts along elements is in `theta_forces` and `law_forces`; `loads` (F, n), by column, push bodies.
+    theta_forces, law_forces: sources along elements; loads: on the degrees of freedom, (F, n), by column.
     """
     plant, grid = forward.plant, forward.part.grid
     structure = plant.structure
@@ -94,9 +94,9 @@ def line_load(line: FloatArray) -> FloatArray:
 
 
 def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: ComplexArray) -> FloatArray:
-    """Motion along ports (m, E) of a floating system under forces (F, s, columns) along sources (s, E).
+    """Motion along ports (m, E) of an unconstrained system under forces (F, s, columns) along sources (s, E).
 
-    (2, N, m, columns): the mean of a force and the line that joins its ends act through polynomials.
+    (2, N, m, columns): mean and end-to-end line of a force act through polynomials.
     """
     plant, grid = forward.plant, forward.part.grid
     H = plant.structure.H
@@ -115,11 +115,11 @@ def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: C
 def tangent(
     forward: Forward, forces: LawForces, motions: FloatArray, correction: SmootherCorrection | None
 ) -> ComplexArray:
-    """Spectra (F, m, columns) of the forces by which the laws answer small motions along their ports.
+    """Spectra (F, m, columns) of the laws' reaction to small motions along their ports.
 
-    The law's tangent along the trajectory, less its equivalent, which the plant carries, closed over the plant:
-    f = s (d0 + D f) with the slopes s over time, solved for all columns at once.  Laws with memory have no tangent
-    in one instant; for them the equivalent stands.
+    The tangent along the trajectory less the equivalent, which is part of the plant, in closed loop with the plant:
+    f = s (d0 + D f) with the slopes s over time, solved for all columns at once.  Laws with memory have no
+    instantaneous tangent; their equivalent is used instead.
     """
     plant, grid = forward.plant, forward.part.grid
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
@@ -128,7 +128,7 @@ def tangent(
     if correction is not None:
         compliance[grid.band] -= correction.deflection @ correction.seen
     jw = 1j * grid.omega[:, None, None]
-    if not plant.floats:  # single precision is ample for what is solved to a few thousandths, and quick
+    if not plant.floats:  # single precision suffices for a tolerance of a few thousandths
         slopes, motions = slopes.astype(np.float32), motions.astype(np.float32)
         compliance, jw = compliance.astype(np.complex64), jw.astype(np.complex64)
     along_d, along_v = slopes[0, :, :, None], slopes[1, :, :, None]
@@ -148,7 +148,7 @@ def tangent(
 
 
 def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatArray:
-    """x with apply(x) = right, one Krylov space per last-axis column, all at once (Saad and Schultz 1986)."""
+    """Solution x of apply(x) = right by GMRES for all last-axis columns at once (Saad and Schultz 1986)."""
     size = np.sqrt(np.sum(right**2, axis=(0, 1)))
     used = size > 0
     if not used.any():
@@ -212,10 +212,10 @@ def law_force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:
 
 
 class SmootherCorrection:
-    """What of a motion along the laws' ports the smoothed inputs take back.
+    """The part of a motion along the laws' ports that the smoother compensates.
 
-    Inputs are smoothed anew when a value moves, so that the motion moves only as far as sensors and inputs allow: where
-    a force's noise is large, not at all.
+    Inputs are smoothed anew when a value changes, so that the motion changes only as far as the noise of sensors and
+    inputs allows: with large force noise, not at all.
     """
 
     def __init__(self, whitener: Whitener, forward: Forward, forces: LawForces) -> None:
@@ -232,7 +232,7 @@ class SmootherCorrection:
         self.seen = whitener.factor @ shown @ ports.T  # whitened sensor signals per force along the ports
 
     def motion(self, whitened: ComplexArray) -> FloatArray:
-        """Deflection and rate along the ports taken back of whitened sensor signals (F, S, c), (2, N, m, c)."""
+        """Compensated deflection and rate along the ports, (2, N, m, c), of whitened sensor signals (F, S, c)."""
         result = np.empty((2, self.grid.samples, self.deflection.shape[1], whitened.shape[2]))
         for k, rows in enumerate((self.deflection, self.rate)):
             spectra = np.zeros((len(self.grid.omega), *result.shape[2:]), dtype=complex)

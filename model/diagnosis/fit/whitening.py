@@ -1,4 +1,4 @@
-"""Residuals weighed by their covariance: noise of the sensors and of the inputs, through the plant."""
+"""Whitening of residuals by their covariance: noise of the sensors, and of the inputs through the plant."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Whitener:
     """Inverse Cholesky factors of the residual's covariance on the compared bins."""
 
     factor: ComplexArray  # (F, S, S)
-    smoother_gain: ComplexArray  # whitened residual to the inputs' share of it, supports then forces, (F, inputs, S)
+    smoother_gain: ComplexArray  # from whitened residual to input noise, supports then forces, (F, inputs, S)
     weight: FloatArray  # of the bins among real numbers, (F,)
 
     @property
@@ -27,7 +27,7 @@ class Whitener:
         return -2 * float(self.weight**2 @ np.sum(np.log(size), axis=1))
 
     def log_det_slope(self, change: ComplexArray) -> float:
-        """Rise of `log_det` per unit of a change (F, S, inputs) of what the sensors show of the inputs."""
+        """Derivative of `log_det` along a change (F, S, inputs) of the response to the inputs."""
         return 2 * float(self.weight**2 @ np.real(np.einsum("fst,fti,fis->f", self.factor, change, self.smoother_gain)))
 
     @classmethod

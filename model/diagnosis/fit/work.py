@@ -1,6 +1,6 @@
-"""What the fits of one diagnosis may cost: counted, not timed, so that a slow machine says what a fast one does.
+"""Budget of work of one diagnosis: counted, not timed, so that results do not depend on the machine.
 
-A service that has to end a diagnosis at some time sets a time, too: a search that ends there reports what it found.
+A service may set a time limit as well; a search that reaches it reports its findings so far.
 """
 
 from __future__ import annotations
@@ -11,35 +11,35 @@ from collections.abc import Sequence
 
 
 class WorkBudget:
-    """Samples of all models that were linearised, and how many may be.
+    """Number of samples of all linearised models, and its limit.
 
-    Solving a law's balance counts as a share of that for every time the law is asked for its force over the record.
+    Every evaluation of a law over the record counts as a share of a linearisation.
     """
 
     def __init__(self, most: float, until: float = math.inf) -> None:
-        """until: of `time.monotonic`, from which on no candidate is fitted any more."""
+        """until: time limit by `time.monotonic`, s."""
         self.most = most
         self.until = until
         self.done = 0.0
 
     def add(self, samples: float) -> None:
-        """One more linearisation, or as much of one as a balance takes."""
+        """Count a linearisation, or the equivalent share of one."""
         self.done += samples
 
     @property
     def ended(self) -> bool:
-        """Whether no candidate is fitted any more."""
+        """Whether the budget or the time limit is exhausted."""
         return self.done >= self.most or time.monotonic() >= self.until
 
     @property
     def limit(self) -> str:
-        """What the search ends at, in words."""
+        """The limit that was reached, in words."""
         return "budget of work" if self.done >= self.most else "limit of time"
 
     def apart(self, count: int) -> list[WorkBudget]:
-        """A budget for each of so many threads, all that is left: none depends on how far the others are."""
+        """Budgets for `count` threads, each with all that is left: independent of the other threads' progress."""
         return [WorkBudget(self.most - self.done, self.until) for _ in range(count)]
 
     def gather(self, parts: Sequence[WorkBudget]) -> None:
-        """Count what threads have spent."""
+        """Count the work of threads."""
         self.done += sum(part.done for part in parts)

@@ -15,7 +15,7 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.formula_doubt import doubt_of
 from sprung.model.diagnosis.investigation.formula_search import FormulaSearch
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.diagnosis.selection.compete import Trial, compete, graded, noise_bound
+from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete, noise_bound
 from sprung.model.diagnosis.selection.holdout import HeldOut
 
 _NO_FORMULA = "no formula of the grammar explains as much as the measured force map"
@@ -36,11 +36,11 @@ def formula_of(problem: Problem, base: Fit, unnamed: Trial, held: HeldOut) -> tu
         trials = compete(problem, base, singles)
         found, reason = _accepted(problem, base, trials, unnamed, held)
         if found is None or excess_chi_square(problem, found.fit) > 0:
-            trials = graded(problem, base, [*trials, *compete(problem, base, pairs)])
+            trials = by_evidence(problem, base, [*trials, *compete(problem, base, pairs)])
             found, reason = _accepted(problem, base, trials, unnamed, held)
             if found is not None:  # along its motion a single shape may suffice
                 singles, _ = FormulaSearch.along(problem, found.fit).best()
-                trials = graded(problem, base, [*trials, *compete(problem, base, singles)])
+                trials = by_evidence(problem, base, [*trials, *compete(problem, base, singles)])
                 found, reason = _accepted(problem, base, trials, unnamed, held)
         if found is not None:
             return _without_variant(found), ""

@@ -11,7 +11,14 @@ from sprung.model.diagnosis.investigation.calibration import faulty, within_tole
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
 from sprung.model.diagnosis.investigation.setup_effects import WRONG_BODY
 from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
-from sprung.model.diagnosis.investigation.verdict import EffectKind, HeldOutErrors, bounded_noise, kind_of, verdict_of
+from sprung.model.diagnosis.investigation.verdict import (
+    EffectKind,
+    HeldOutErrors,
+    Verdict,
+    bounded_noise,
+    kind_of,
+    verdict_of,
+)
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, VerdictRules
@@ -27,10 +34,11 @@ _BAND = 0.8  # of the power of what is left, for the frequencies where it lies
 def judged(
     state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...], ended: str = ""
 ) -> Judgement:
-    """Errors and verdict of an investigation; ended: what its search ended at, empty where it came to its end.
+    """Errors and verdict of an investigation.
 
-    Where laws follow the sensors' motion and the free run loses its phase, errors of the run say little: then the
-    forces that nobody measured are judged, over the inertia forces.
+    before, after: free runs without and with the findings.  ended: the limit that ended the search, or empty.  If
+    laws act along the measured motion and the free run loses its phase, its errors are not informative; the verdict
+    is then based on the unmeasured forces relative to the inertia forces.
     """
     rules = state.options.rules.verdict
     noise = bounded(state)
@@ -39,24 +47,11 @@ def judged(
     expected = floor / np.where(size > 0, size, 1.0)
     errors = HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after, rules))
     lost = state.problem.process_noise and after.nrmse > rules.rejected
-    deciding = errors
-    if lost:
-        shares = [unmeasured_share(fit, level.force) for fit, level in _compared(state, noise)]
-        deciding = HeldOutErrors(*(np.array([share]) for share in shares))
-    if state.setup_faults and not lost:  # they were undone before anything was fitted
-        worst = np.sqrt(state.setup_faults[0].before / len(size))
-        deciding = replace(errors, before=np.maximum(errors.before, worst))
-    terms = state.fit.point.terms[state.given :]
-    physics = [_kind(state, term, found.trial.term.law) for found, term in zip(state.found, terms, strict=True)]
-    kinds = [kind_of(fault.effect) for fault in state.setup_faults]
-    kinds += [_kind(state, fault.term, fault.term.law) for fault in state.input_faults]
-    kinds += [kind_of(state.fit.point.terms[index].law) for index in faulty(state)]
-    kinds += [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
+    deciding = _deciding_errors(state, errors, noise, lost=lost)
+    faults, physics = _kinds_of_faults(state, noisy), _kinds_of_physics(state)
     other = another_structure(state, deciding)
-    verdict = verdict_of(kinds + physics, deciding, rules, other_structure=other, ended=bool(ended))
+    verdict = verdict_of(faults + physics, deciding, rules, other_structure=other, ended=bool(ended))
     rejected = float(np.sqrt(np.mean(deciding.after**2)))
-    physics = [kind for kind in physics if kind is not EffectKind.NUISANCE]
-    carried = verdict != "unknown_physics" or not physics or physics[0] is EffectKind.UNLISTED
     return Judgement(
         errors=errors,
         verdict=verdict,
@@ -64,11 +59,42 @@ def judged(
         rejected=rejected if other or (verdict == "unknown_physics" and rejected > rules.rejected) else None,
         parts=changed_parts(state) if other else 0,
         lost_phase=lost,
-        carried=carried,
+        carried=_carries(verdict, physics),
         ended=ended,
         place=_place(state),
         where=_words(state, errors, after),
     )
+
+
+def _deciding_errors(state: Investigation, errors: HeldOutErrors, noise: Noise, *, lost: bool) -> HeldOutErrors:
+    """The errors on which the verdict is based; lost: the free run loses its phase."""
+    if lost:
+        shares = [unmeasured_share(fit, level.force) for fit, level in _compared(state, noise)]
+        return HeldOutErrors(*(np.array([share]) for share in shares))
+    if state.setup_faults:  # corrected before the first fit, from which the errors count
+        worst = np.sqrt(state.setup_faults[0].before / len(errors.before))
+        return replace(errors, before=np.maximum(errors.before, worst))
+    return errors
+
+
+def _kinds_of_faults(state: Investigation, noisy: tuple[NoiseFault, ...]) -> list[EffectKind]:
+    """Kinds of all faults beside the findings of the search."""
+    kinds = [kind_of(fault.effect) for fault in state.setup_faults]
+    kinds += [_kind(state, fault.term, fault.term.law) for fault in state.input_faults]
+    kinds += [kind_of(state.fit.point.terms[index].law) for index in faulty(state)]
+    return kinds + [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
+
+
+def _kinds_of_physics(state: Investigation) -> list[EffectKind]:
+    """Kinds of the findings of the search, best first."""
+    terms = state.fit.point.terms[state.given :]
+    return [_kind(state, term, found.trial.term.law) for found, term in zip(state.found, terms, strict=True)]
+
+
+def _carries(verdict: Verdict, physics: list[EffectKind]) -> bool:
+    """Whether the findings carry the verdict: they explain more than they leave."""
+    kinds = [kind for kind in physics if kind is not EffectKind.NUISANCE]
+    return verdict != "unknown_physics" or not kinds or kinds[0] is EffectKind.UNLISTED
 
 
 def _kind(state: Investigation, term: Term, law: Law) -> EffectKind:

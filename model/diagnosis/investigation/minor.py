@@ -52,7 +52,7 @@ def _hopeless(state: Investigation, candidate: Candidate) -> bool:
     rules = state.options.rules.acceptance
     left = float(np.sum(state.fit.noise.force**2))
     promised = rules.better_than_promised * left * candidate.score / state.fit.chi_square
-    return any(promised < min(rules.minor_beside * trial.worth, rules.most_left * left) for trial in there)
+    return any(promised < min(rules.minor_beside * trial.reduction, rules.most_left * left) for trial in there)
 
 
 def is_minor(state: Investigation, trial: Trial) -> bool:
@@ -72,9 +72,11 @@ def is_minor(state: Investigation, trial: Trial) -> bool:
             return True
         elif state.problem.process_noise:
             left = float(np.sum(state.fit.noise.force**2))
-            if trial.worth < min(rules.minor_beside * found.trial.worth, rules.most_left * left):
+            if trial.reduction < min(rules.minor_beside * found.trial.reduction, rules.most_left * left):
                 return True
-        elif trial.worth < rules.minor_beside * _wald_statistic(state.fit, state.given + index, found.trial.term.law):
+        elif trial.reduction < rules.minor_beside * _wald_statistic(
+            state.fit, state.given + index, found.trial.term.law
+        ):
             return not _explains_most_of_the_rest(state, trial)
     return False
 
@@ -85,7 +87,7 @@ def _of_all_springs(law: Law) -> bool:
 
 def _explains_most_of_the_rest(state: Investigation, trial: Trial) -> bool:
     """Whether a small second law explains most of a residual that is far more than noise."""
-    most = trial.worth > state.options.rules.verdict.carried * state.fit.chi_square
+    most = trial.reduction > state.options.rules.verdict.carried * state.fit.chi_square
     return most and leaves_more_than_noise(state)
 
 

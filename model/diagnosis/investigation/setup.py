@@ -207,6 +207,19 @@ def _after(accepted: _Accepted) -> float:
 def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total: float) -> Iterator[list[Hypothesis]]:
     """Hypotheses to be fitted, the most promising first: of channels, then of the system file."""
     rules = problem.rules.setup
+    ranking = _promising(system, signals, problem, fit)
+    unranked = [h for h in ranking if h.misfit >= rules.promising and not h.by_mass]
+    unranked = unranked if len(unranked) <= rules.few else []
+    ranked = [h for h in ranking if h.by_mass]
+    ranked += [h for h in ranking if not h.effect.ordinary and h not in (*unranked, *ranked)][: rules.tried] + unranked
+    if ranked:
+        yield ranked + [h for h in ranking if h.effect.ordinary][: rules.beside]
+    yield _promising_of_file(problem, fit, total)
+
+
+def _promising(system: System, signals: Signals, problem: Problem, fit: Fit) -> list[Hypothesis]:
+    """Faults of channels that may explain the misfit, by what they leave of it, with the fit or nominal parameters."""
+    rules = problem.rules.setup
     nominal = Forward(system, fit.forward.part, problem.sensors, np.zeros(len(fit.point.theta)))
     promising: dict[tuple[SetupEffect, str, bool], Hypothesis] = {}
     for one in (ModelResponse.of(problem, fit.forward), ModelResponse.of(problem, nominal)):
@@ -215,22 +228,21 @@ def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total:
             key = (hypothesis.effect, hypothesis.site.location, hypothesis.by_mass)
             share = replace(hypothesis, misfit=hypothesis.misfit / whole)
             # under a measured force, spectra at wrong resonances determine neither signs nor exchanges
-            always = problem.process_noise and hypothesis.unranked
-            good = always or hypothesis.by_mass or share.misfit < rules.promising
-            if good and (key not in promising or share.misfit < promising[key].misfit):
+            always = hypothesis.by_mass or (problem.process_noise and hypothesis.unranked)
+            better = key not in promising or share.misfit < promising[key].misfit
+            if better and (always or share.misfit < rules.promising):
                 promising[key] = share
-    ranking = sorted(promising.values(), key=lambda h: h.misfit)
-    forced = [h for h in ranking if h.misfit >= rules.promising and not h.by_mass]
-    forced = forced if len(forced) <= rules.few else []
-    ranked = [h for h in ranking if h.by_mass]
-    ranked += [h for h in ranking if not h.effect.ordinary and h not in (*forced, *ranked)][: rules.tried] + forced
-    if ranked:
-        yield ranked + [h for h in ranking if h.effect.ordinary][: rules.beside]
-    of_file: dict[tuple[SetupEffect, str, str], Hypothesis] = {}
+    return sorted(promising.values(), key=lambda h: h.misfit)
+
+
+def _promising_of_file(problem: Problem, fit: Fit, total: float) -> list[Hypothesis]:
+    """Faults of the system file that may explain the misfit, the best of each place."""
+    rules = problem.rules.setup
+    best: dict[tuple[SetupEffect, str, str], Hypothesis] = {}
     for hypothesis in sorted(structure_hypotheses(problem, fit, rules), key=lambda h: h.misfit):
         if hypothesis.misfit < rules.promising * total:
-            of_file.setdefault((hypothesis.effect, hypothesis.site.location, hypothesis.site.detail), hypothesis)
-    yield list(of_file.values())[: rules.tried]
+            best.setdefault((hypothesis.effect, hypothesis.site.location, hypothesis.site.detail), hypothesis)
+    return list(best.values())[: rules.tried]
 
 
 def _fault(hypothesis: Hypothesis, before: float, after: float) -> SetupFault:

@@ -21,7 +21,7 @@ from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import WIDER, Term
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
-from sprung.model.diagnosis.selection.compete import Trial, compete, graded
+from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete
 from sprung.model.diagnosis.selection.evidence import occam_cost, profile_gain
 from sprung.model.diagnosis.selection.plausible import doubt
 from sprung.model.laws import ElementLaw, Observed, observe
@@ -116,7 +116,7 @@ def with_wider_rivals(state: Investigation, trials: list[Trial]) -> list[Trial]:
             candidates += [replace(trial.candidate, term=start.terms[-1], start=start) for start in starts]
     if not candidates or state.problem.process_noise:
         return trials
-    return graded(state.problem, state.fit, [*trials, *compete(state.problem, state.fit, candidates)])
+    return by_evidence(state.problem, state.fit, [*trials, *compete(state.problem, state.fit, candidates)])
 
 
 def _widened(state: Investigation, index: int) -> Fit | None:

@@ -1,6 +1,6 @@
-"""Which candidate, if any: full fits of the best screened ones, compared by evidence, one finding after the other.
+"""Model selection: full fits of the candidates with the highest scores, compared by evidence, one finding at a time.
 
-What a fit is worth and what its parameters cost: `evidence`.
+`evidence` holds the formulas.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from sprung.model.diagnosis.selection.starts import alike_starts, starts_of
 
 @dataclass(frozen=True)
 class Trial:
-    """A candidate with everything refitted around it."""
+    """A candidate with all parameters refitted beside it."""
 
     candidate: Candidate
     fit: Fit
     gain: float  # twice the log-likelihood ratio against the model without it
-    worth: float  # of what was missing: its fall of chi-square, or of the power of forces that nobody measured
+    reduction: float  # of chi-square, or of the power of unmeasured forces
     evidence: float  # gain less what its parameters cost
-    freedom: int  # parameters of the law, and states that it brings
+    freedom: int  # parameters of the law and states it adds
     finished: bool = True
 
     @property
@@ -48,15 +48,15 @@ class Trial:
 
     @property
     def explains(self) -> float:
-        """How much of what was missing: evidence, or power of forces that nobody measured."""
-        return self.worth if self.fit.noise.process_noise else self.gain
+        """The part of the residual it explains: likelihood gain, or power of unmeasured forces."""
+        return self.reduction if self.fit.noise.process_noise else self.gain
 
     @property
     def named(self) -> bool:
         return self.term.law.named
 
     def p_value(self, tests: int) -> float:
-        """Chance of such a gain among so many candidates, noise levels unknown."""
+        """Probability of such a gain under noise alone among `tests` candidates, noise levels unknown."""
         return chance(self.gain, self.freedom, tests)
 
     def delta_bic(self) -> float:
@@ -72,10 +72,10 @@ def shortlist(
     *,
     gross: bool = False,
 ) -> list[Candidate]:
-    """Significant candidates that could be the best, one per law, place and variant; none of input channels.
+    """Significant candidates that could be the best, one per law, place and variant; no faults of input channels.
 
-    gross: whether the motion that they were scored along is far from the measured one.  Then scores tell the place, but
-    not which of an element's laws acts there: what yields all the time is hardly seen along a motion that does not.
+    gross: whether the model's motion is far from the measured one.  Scores then indicate the place, but not which of
+    an element's laws acts there: a law that yields permanently has little effect along a motion without yielding.
     """
     good = [h for h in screening.candidates if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
     if not good:
@@ -107,68 +107,80 @@ def compete(
     candidates: list[Candidate],
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Trial]:
-    """Fits of the candidates around the present model, best evidence first."""
-    rules = problem.rules.selection
+    """Fits of the candidates beside the present model, best evidence first.
+
+    Laws with names come first: an unnamed force is only fitted where it could still explain enough more than they do.
+    """
     places = sorted({candidate.location for candidate in candidates})
     progress(f"fitting {len(candidates)} candidates at {', '.join(places)}")
-
-    screened = problem.rules.screening
-    again = rules.again * max((candidate.strength(screened) for candidate in candidates), default=0.0)
-
-    def begun(chosen: list[Candidate]) -> list[Trial]:
-        tried = _shared(
-            lambda own, candidate: _begun(own, base, candidate, candidate.strength(screened) > again), problem, chosen
-        )
-        return [trial for trial in tried if trial is not None]
-
-    def finished(chosen: list[Trial]) -> list[Trial]:
-        return _shared(lambda own, trial: _finished(own, base, trial), problem, chosen)
-
-    trials = begun([candidate for candidate in candidates if candidate.term.law.named])
-    trials += begun(
-        [
-            candidate
-            for candidate in candidates
-            if not candidate.term.law.named and _may_lead(problem, candidate, trials)
-        ]
-    )
-    trials = graded(problem, base, trials)
+    trials = _initial_fits(problem, base, candidates)
     if not trials:
         return []
-    best = trials[0].evidence
-
-    def close(rank: int, trial: Trial) -> bool:
-        near = problem.process_noise or trial.evidence > best - max(rules.near, rules.near_share * abs(best))
-        return rank < rules.last or (rank < rules.finished and near)
-
-    leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
-    behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
-    named = finished([trial for trial in leading if trial.named])
+    leading, behind = _leading(problem, trials)
+    named = _converged_fits(problem, base, [trial for trial in leading if trial.named])
     unnamed = [trial for trial in leading if not trial.named]
-    if not any(_may_lead(problem, trial.candidate, named) for trial in unnamed):
-        all_trials = [*named, *(replace(trial, finished=False) for trial in unnamed), *behind]
+    if any(_could_lead(problem, trial.candidate, named) for trial in unnamed):
+        unnamed = _converged_fits(problem, base, unnamed)
     else:
-        all_trials = [*named, *finished(unnamed), *behind]
-    return _settled(problem, base, graded(problem, base, all_trials))
+        unnamed = [replace(trial, finished=False) for trial in unnamed]
+    return _with_unconverged_refitted(problem, base, by_evidence(problem, base, [*named, *unnamed, *behind]))
 
 
-def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
-    """Trials by evidence, none of which could lead if only it were fitted on: a fit that still falls is no gain."""
-    stuck: list[Fit] = []  # that were fitted on and got no further
+def _initial_fits(problem: Problem, base: Fit, candidates: list[Candidate]) -> list[Trial]:
+    """First fits of the candidates, best evidence first."""
+    screened = problem.rules.screening
+    most = max((candidate.strength(screened) for candidate in candidates), default=0.0)
+    again = problem.rules.selection.again * most
+
+    def initial_fit(own: Problem, candidate: Candidate) -> Trial | None:
+        return _initial_fit(own, base, candidate, candidate.strength(screened) > again)
+
+    def fits(chosen: list[Candidate]) -> list[Trial]:
+        return [trial for trial in _in_parallel(initial_fit, problem, chosen) if trial is not None]
+
+    trials = fits([candidate for candidate in candidates if candidate.term.law.named])
+    unnamed = [candidate for candidate in candidates if not candidate.term.law.named]
+    trials += fits([candidate for candidate in unnamed if _could_lead(problem, candidate, trials)])
+    return by_evidence(problem, base, trials)
+
+
+def _leading(problem: Problem, trials: list[Trial]) -> tuple[list[Trial], list[Trial]]:
+    """The trials, best first, whose fits are to be finished, and the others."""
+    rules, best = problem.rules.selection, trials[0].evidence
+    leading, behind = [], []
+    for rank, trial in enumerate(trials):
+        close = problem.process_noise or trial.evidence > best - max(rules.near, rules.near_share * abs(best))
+        if rank < rules.last or (rank < rules.finished and close):
+            leading.append(trial)
+        else:
+            behind.append(replace(trial, finished=False))
+    return leading, behind
+
+
+def _converged_fits(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
+    """The trials fitted to convergence, in parallel."""
+    return _in_parallel(lambda own, trial: _converged_fit(own, base, trial), problem, trials)
+
+
+def _with_unconverged_refitted(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
+    """Trials by evidence, after further iterations of unconverged fits that could still take the lead."""
+    exhausted: list[Fit] = []  # that further iterations did not improve
     for _ in range(problem.rules.selection.settling):
         best = trials[0].evidence
-        unsettled = [t for t in trials if t.finished and not t.fit.converged and all(t.fit is not one for one in stuck)]
+        unsettled = [
+            t for t in trials if t.finished and not t.fit.converged and all(t.fit is not one for one in exhausted)
+        ]
         falling = [t for t in unsettled if t.evidence + t.fit.left / t.fit.grain > best]
         if not falling:
             break
         others = [t for t in trials if all(t is not one for one in falling)]
-        again = _shared(lambda own, trial: _finished(own, base, trial), problem, falling)
-        stuck += [new.fit for old, new in zip(falling, again, strict=True) if new.evidence <= old.evidence]
-        trials = graded(problem, base, [*again, *others])
+        again = _converged_fits(problem, base, falling)
+        exhausted += [new.fit for old, new in zip(falling, again, strict=True) if new.evidence <= old.evidence]
+        trials = by_evidence(problem, base, [*again, *others])
     return trials
 
 
-def _shared(work: Callable[[Problem, Piece], Result], problem: Problem, pieces: Sequence[Piece]) -> list[Result]:
+def _in_parallel(work: Callable[[Problem, Piece], Result], problem: Problem, pieces: Sequence[Piece]) -> list[Result]:
     """Pieces of work on one problem, shared among threads, each with a budget of its own."""
     if problem.work is None:
         return share(lambda piece: work(problem, piece), pieces, WORKERS)
@@ -182,7 +194,7 @@ def _shared(work: Callable[[Problem, Piece], Result], problem: Problem, pieces: 
 def runner_up(
     problem: Problem, base: Fit, candidates: list[Candidate], chosen: Trial, tried: list[Trial]
 ) -> Trial | None:
-    """The best candidate with another law, at the same place before others; a candidate is fitted where none was."""
+    """The best trial with another law, at the same place before others; if there is none, candidates are fitted."""
     rivals = [t for t in tried if t.term.law.name != chosen.term.law.name and t.gain > 0]
     if rivals:
         return max(rivals, key=lambda t: (t.term.location == chosen.term.location, t.evidence))
@@ -190,16 +202,17 @@ def runner_up(
     rules = problem.rules
     others = [h for h in candidates if h.effect != chosen.candidate.effect and h.score > 0 and h.term.key not in fitted]
     for candidate in sorted(others, key=lambda h: h.strength(rules.screening), reverse=True)[: rules.selection.further]:
-        trial = _begun(problem, base, candidate)
+        trial = _initial_fit(problem, base, candidate)
         if trial is not None and trial.gain > 0:
             return replace(trial, finished=False)
     return None
 
 
-def _begun(problem: Problem, base: Fit, candidate: Candidate, again: bool = False) -> Trial | None:
-    """A candidate fitted far enough to see what it is worth, from the best of several starts.
+def _initial_fit(problem: Problem, base: Fit, candidate: Candidate, again: bool = False) -> Trial | None:
+    """A few iterations of a candidate from each of its starts, and the best of these fits; None if all diverge.
 
-    again: whether a law with look-alikes of its own starts from those too, where its first fits leave much.
+    again: whether a law that has look-alikes among its own values is started from these too, if its first fits leave
+    more than noise.
     """
     problem = replace(problem, newton_allowed=False)
     starts = starts_of(problem, base, candidate)
@@ -212,7 +225,7 @@ def _begun(problem: Problem, base: Fit, candidate: Candidate, again: bool = Fals
 
 
 def _leaves_much(problem: Problem, trial: Trial) -> bool:
-    """Whether a fit is no end: more than noise is left, or, where noise is what is fitted, it still falls."""
+    """Whether a fit leaves more than noise or, where the noise of forces is fitted too, has not converged."""
     if problem.process_noise:
         return not trial.fit.converged
     return trial.fit.reduced > noise_bound(problem, trial.fit)
@@ -223,22 +236,24 @@ def noise_bound(problem: Problem, fit: Fit) -> float:
     return 1 + problem.rules.selection.chance * float(np.sqrt(2 / fit.count))
 
 
-def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
-    """Whether an unnamed force could explain enough more than named laws: not where they leave noise and more than
-    it promises is explained.  With one law alone it stays as what that one was chosen before."""
+def _could_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
+    """Whether an unnamed force could explain sufficiently more than the named laws.
+
+    It cannot where the best of several laws leaves only noise and explains more than the score of the force promises.
+    """
     if problem.process_noise or len(named) < 2:
         return True
-    best = max(named, key=lambda trial: trial.worth)
+    best = max(named, key=lambda trial: trial.reduction)
     quiet = problem.rules.evidence.quiet <= best.fit.reduced <= noise_bound(problem, best.fit)
-    return unnamed.score > best.worth or not quiet
+    return unnamed.score > best.reduction or not quiet
 
 
-def graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
-    """Trials by evidence; where one leaves less than the noise that the base's misfit was taken for, by its own."""
+def by_evidence(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
+    """Trials by evidence.  If one leaves less than the noise level estimated without it, its level counts for all."""
     rules = problem.rules.evidence
     least = min((t.fit.reduced for t in trials), default=1.0)
     if least < rules.quiet and not problem.process_noise:
-        again = [_judged(problem, base, t.candidate, t.fit, rules.quiet * least) for t in trials]
+        again = [_trial(problem, base, t.candidate, t.fit, rules.quiet * least) for t in trials]
         trials = [replace(new, finished=t.finished) for new, t in zip(again, trials, strict=True)]
     if not problem.process_noise:
         gains = monotone_gains([t.gain for t in trials], [t.fit.chi_square for t in trials], rules)
@@ -250,33 +265,34 @@ def graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
 
 def _try(problem: Problem, base: Fit, candidate: Candidate, start: Point, iterations: int) -> Trial | None:
     fit = try_optimise(problem, start, iterations, base.whitener)
-    return None if fit is None else _judged(problem, base, candidate, fit)
+    return None if fit is None else _trial(problem, base, candidate, fit)
 
 
-def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
-    """A trial fitted to the end, measured forces with their noise beside it: without the law that stood for it."""
+def _converged_fit(problem: Problem, base: Fit, trial: Trial) -> Trial:
+    """A trial fitted to convergence; with measured forces their noise level is estimated anew, now beside the law."""
     if trial.fit.converged and not problem.process_noise:
         return trial
     finished = _try(problem, base, trial.candidate, trial.fit.point, 10) or trial
     if not problem.process_noise or finished.fit.deviance > base.deviance:
         return finished
     _, fit = refreshed(problem, finished.fit)
-    return _judged(problem, base, trial.candidate, fit)
+    return _trial(problem, base, trial.candidate, fit)
 
 
-def _judged(problem: Problem, base: Fit, candidate: Candidate, fit: Fit, quiet: float | None = None) -> Trial:
+def _trial(problem: Problem, base: Fit, candidate: Candidate, fit: Fit, quiet: float | None = None) -> Trial:
+    """A fit with its evidence over the base.  quiet: level below which blocks are no evidence; None: by the rules."""
     rules = problem.rules.evidence
     quiet = rules.quiet if quiet is None else quiet
     sensors = len(problem.sensors)
-    if problem.process_noise:  # how noisy the forces are is what candidates differ in
+    if problem.process_noise:  # candidates differ in the noise level of the forces
         gain = process_gain(base.residual, fit.residual, sensors, (base.log_det, fit.log_det), rules)
-        worth = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
+        reduction = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
     else:
-        worth = base.chi_square - fit.chi_square
-        gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet, rules))
-    dear = cost(fit, rules)
+        reduction = base.chi_square - fit.chi_square
+        gain = min(reduction, profile_gain(base.residual, fit.residual, sensors, quiet, rules))
+    parameter_cost = cost(fit, rules)
     freedom = len(candidate.term.parameters) + len(fit.point.state) - len(base.point.state)
-    return Trial(candidate, fit, gain, worth, gain - dear, freedom)
+    return Trial(candidate, fit, gain, reduction, gain - parameter_cost, freedom)
 
 
 def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> list[Trial]:
@@ -290,10 +306,10 @@ def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> l
 
 
 def cost(fit: Fit, rules: EvidenceRules = RULES.evidence, index: int = -1) -> float:
-    """What a law, the last by default, costs in evidence: by its parameters and its rarity."""
+    """Cost in evidence of a law's parameters and of its rarity; index: of the term, by default the last."""
     term, place = fit.point.terms[index], fit.place(index)
     block = fit.covariance[place, place]
-    if not term.law.named:  # amplitudes of one curve, which differ from each other's by convention: each by itself
+    if not term.law.named:  # amplitudes of one curve, correlated by convention: each counts by itself
         block = np.diag(np.diag(block))
     logs = [spec.log for spec in term.law.parameters]
     total = occam_cost(logs, term.scales, block / np.outer(term.slopes, term.slopes), rules)

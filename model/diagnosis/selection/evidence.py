@@ -1,20 +1,20 @@
-"""What a better fit is worth: pure functions of residuals, and of what parameters cost.
+"""Evidence of models: pure functions of residuals, and the costs of parameters.
 
 Gain of a candidate:   sum over blocks (sensor, band) of  n log(chi^2 before / chi^2 after),
 
 twice the log-likelihood ratio with the noise level of every block profiled out, so that coloured noise of unknown
 level does not count as evidence; where the noise is white and known it equals the fall of chi^2.
 
-A test by a sine or a slow sweep has its signal in a few bins.  A law that explains it may make many quiet blocks a
-little louder, and a plain sum of logarithms lets their number outvote the signal.  What blocks lose is therefore
-weighed by power: of the sum of all gains, they take away at most the share in which chi^2 rises there of what it
-falls elsewhere.  So a fall of chi^2 is never evidence against a model.
+The signal of a sine test or a slow sweep lies in few bins.  A law that explains it may raise many quiet blocks
+slightly, and in a plain sum of logarithms their number would outweigh the signal.  Losses of blocks are therefore
+weighted by power: they reduce the sum of gains at most by the ratio of the rise of chi^2 in them to its fall elsewhere.
+A fall of chi^2 is then never evidence against a model.
 
 Evidence of a model, up to constants:   gain - log det(I + W C^-1 W),   W = diag(width / sqrt(2 pi))
 
 with C the covariance of the law's parameters (Laplace's approximation with priors of `width`, MacKay 2003, chapter 28),
-which is 2 log(width / (sigma sqrt(2 pi))) of a single one: a parameter costs what the recording tells about it, so a
-shape that does not matter costs nothing, where BIC would charge log n for it.
+which is 2 log(width / (sigma sqrt(2 pi))) of a single one.  A parameter costs as much as the recording determines it;
+a shape parameter without influence costs nothing, whereas BIC would charge log n for it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scipy import stats
 from sprung.model.diagnosis.rules import RULES, EvidenceRules
 from sprung.model.signals import FloatArray
 
-_SINGULAR = 1e-13  # share of a variance, below which rounding is all that there is
+_SINGULAR = 1e-13  # relative variance below which only rounding remains
 
 
 def block_edges(bins: int, rules: EvidenceRules = RULES.evidence) -> np.ndarray:
@@ -41,9 +41,9 @@ def block_edges(bins: int, rules: EvidenceRules = RULES.evidence) -> np.ndarray:
 def profile_gain(
     before: FloatArray, after: FloatArray, sensors: int, quiet: float, rules: EvidenceRules = RULES.evidence
 ) -> float:
-    """Gain of one whitened residual (2 F S,) over another that is weighed by the same covariance.
+    """Gain of one whitened residual (2 F S,) over another that is weighted by the same covariance.
 
-    A block quieter than `quiet` times the estimated noise, which is white, owes that to its colour: no evidence.
+    Levels below `quiet` times the estimated white noise are due to coloured noise, and are no evidence.
     """
     logs, falls = _of_blocks(before, after, sensors, quiet, rules)
     return bounded_gain(logs, falls)
@@ -56,10 +56,10 @@ def process_gain(
     log_dets: tuple[float, float],
     rules: EvidenceRules = RULES.evidence,
 ) -> float:
-    """Gain where each residual is weighed by a covariance of its own, with the log determinants of both.
+    """Gain of residuals weighted by covariances of their own, with the log determinants of both.
 
-    A model that needs less noise of the measured forces is weighed more sharply: its blocks may look louder while its
-    determinant falls.  The two belong together, so that nothing of the blocks is left out.
+    A model with a lower noise level of the measured forces has larger weights: its blocks may rise while its
+    determinant falls.  Both are parts of one likelihood, so no block is bounded.
     """
     logs, _ = _of_blocks(before, after, sensors, 0.0, rules)
     return float(np.sum(logs)) + log_dets[0] - log_dets[1]
@@ -78,7 +78,7 @@ def _of_blocks(
 
 
 def bounded_gain(logs: FloatArray, falls: FloatArray) -> float:
-    """Sum of logarithmic gains of blocks whose losses weigh no more than their share of the power.
+    """Sum of logarithmic gains of blocks, with losses weighted by no more than their share of the power.
 
     logs, falls: n log(before / after) and the fall of chi-square of every block, of the same signs.
     """
@@ -92,10 +92,10 @@ def bounded_gain(logs: FloatArray, falls: FloatArray) -> float:
 
 
 def monotone_gains(gains: Sequence[float], left: Sequence[float], rules: EvidenceRules = RULES.evidence) -> list[float]:
-    """Gains of rival fits, none more than that of one that leaves clearly less chi-square.
+    """Gains of rival fits, none above that of a fit with clearly smaller chi-square.
 
-    Sums of logarithms weigh quiet blocks like loud ones; that may tell fits apart which leave about the same, but no
-    fit wins by them against one that is plainly better.
+    Sums of logarithms weight quiet and loud blocks equally.  They may separate fits of similar chi-square, but must
+    not prefer a fit to one that is clearly better.
     """
     return [
         min([gain, *(other for other, chi in zip(gains, left, strict=True) if rules.plainly * chi < own)])
@@ -109,10 +109,10 @@ def occam_cost(
     covariance: FloatArray,
     rules: EvidenceRules = RULES.evidence,
 ) -> float:
-    """What free parameters cost: by how much narrower the recording makes them, together, than their priors were.
+    """Occam factor of free parameters: the log determinant of I + W C^-1 W, with W the widths of their priors.
 
-    Numbers of which it tells a product alone, such as a stiffness and what it yields over, are told nothing one by one
-    and cost as much as the one number that the product is: the log determinant of I + W C^-1 W, W the priors' widths.
+    Parameters of which only a product is determined, such as a stiffness and its yield deflection, cost as much as
+    that one number.
 
     covariance: of the parameters as they are searched, logarithms of those of unknown order, (p, p).
     """
@@ -132,7 +132,7 @@ def _log_det(covariance: FloatArray) -> float:
 
 
 def unusual_cost(relative: float, usual: tuple[float, float], rules: EvidenceRules = RULES.evidence) -> float:
-    """What a value outside a law's usual range costs: look-alikes pass into each other there.
+    """Cost of a value outside a law's usual range, where look-alikes become indistinguishable.
 
     relative: the value over the size at which it matters.
     """
@@ -142,7 +142,7 @@ def unusual_cost(relative: float, usual: tuple[float, float], rules: EvidenceRul
 
 
 def chance(gain: float, freedom: int, tests: int) -> float:
-    """Chance of such a gain by noise among so many candidates (Wilks, Bonferroni)."""
+    """Probability of such a gain under noise alone among `tests` candidates (Wilks, Bonferroni)."""
     return float(min(1.0, tests * stats.chi2.sf(max(gain, 0.0), max(1, freedom))))
 
 
@@ -152,9 +152,9 @@ def bic(gain: float, parameters: int, count: int) -> float:
 
 
 def effective_count(residual: FloatArray) -> float:
-    """How many independent numbers a real residual (T,) is worth, by the spread of its periodogram.
+    """Effective number of independent values in a real residual (T,), by the spread of its periodogram.
 
-    T of white noise, about four per line of a periodic error: what repeats itself is one piece of evidence.
+    T for white noise, about four per line of a periodic error: repetitions are not independent evidence.
     """
     power = np.abs(np.fft.rfft(residual)) ** 2
     total = float(np.sum(power))

@@ -1,4 +1,4 @@
-"""Free-run simulation over the whole recording, judged on the part that no fit saw."""
+"""Free-run simulation over the whole recording, judged on its held-out part."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from sprung.model.system import System
 
 _ROUNDS = 4  # of laws' forces and the state at the start
 _SETTLED = 1e-4  # of the laws' forces
-_MARCHED = 2  # of them, in which what does not settle is marched through time: then it starts from what that came to
+_MARCHED = 2  # of them, in which time stepping replaces a harmonic balance that does not converge
 
 
 @dataclass(frozen=True)
 class FreeRun:
-    """What a model says of the held-out part, running on from the part it was fitted to."""
+    """Simulation of the held-out part by a model that continues from the fitted part."""
 
     simulated: FloatArray  # (T, S), held-out samples
     measured: FloatArray  # (T, S)
@@ -44,18 +44,18 @@ class FreeRun:
 
 @dataclass(frozen=True)
 class HeldOutComparison:
-    """What the held-out part says of one fit against another."""
+    """Comparison of two fits on the held-out part."""
 
-    gain: float  # by how much the second says more, as twice the log-likelihood ratio or alike
-    apart: float  # distance of what they say, in units of noise
-    scatter: float  # variance along it: noise, and what the parameters' own uncertainty adds to it at most
-    chance: float = RULES.selection.refuted  # standard deviations that are no longer chance
+    gain: float  # of the second, as twice the log-likelihood ratio
+    apart: float  # distance of the two predictions, in units of noise
+    scatter: float  # variance along it: noise, and an upper bound of the effect of the parameters' uncertainty
+    chance: float = RULES.selection.refuted  # standard deviations beyond which the difference is significant
 
     @property
     def refuted(self) -> bool:
-        """Whether the second says less, and that is no chance.
+        """Whether the second predicts significantly worse.
 
-        Were it true, its gain would scatter about apart^2 by 2 apart: the error of the first is then apart and noise.
+        If it were true, its gain would be distributed about apart^2 with standard deviation 2 apart.
         """
         found: bool = self.gain < min(0.0, self.apart**2 - self.chance * 2 * self.apart * np.sqrt(self.scatter))
         return found
@@ -67,7 +67,7 @@ class HeldOut:
 
     system: System
     signals: Signals
-    noise: Noise  # by which runs are judged
+    noise: Noise  # that weights the errors of runs
     split: int
     rules: Rules = RULES
 
@@ -78,12 +78,12 @@ class HeldOut:
 
     @cached_property
     def whole(self) -> Part:
-        """The whole recording as it is simulated."""
+        """The whole recording, for simulation."""
         return transform(self.signals, self.noise)
 
     @cached_property
     def later(self) -> Part:
-        """The held-out part as it is compared: positions that drift by their rates."""
+        """The held-out part, for comparison: drifting positions are differentiated."""
         return transform(
             self.signals.part(self.split, self.signals.samples), self.noise, differentiated=self.differentiated
         )
@@ -94,26 +94,26 @@ class HeldOut:
 
     @cached_property
     def tracked(self) -> Part:
-        """The whole recording as it is followed: positions that drift by their rates."""
+        """The whole recording, for smoothing: drifting positions are differentiated."""
         return transform(self.signals, self.noise, differentiated=self.differentiated)
 
     @property
     def still(self) -> bool:
-        """Whether the held-out part hardly moves, so that nothing can be judged on it."""
+        """Whether the held-out part hardly moves, so that it cannot validate anything."""
         first, later = (np.std(part, axis=0) for part in np.split(self.signals.sensors, [self.split]))
         return bool(np.all(later < self.rules.selection.still * first))
 
     def run(self, point: Point) -> FreeRun:
-        """Simulate with the measured inputs from the state that the fitted part ends in."""
+        """Simulate the held-out part under the measured inputs, continuing from the fitted part."""
         return self._judged(*self._simulated(point))
 
     def runs(self, *points: Point) -> list[FreeRun]:
-        """The same for several models, simulated beside each other."""
+        """The same for several models, in parallel."""
         return [self._judged(*simulated) for simulated in share(self._simulated, points, WORKERS)]
 
     @cached_property
     def _known(self) -> dict[int, tuple[Point, tuple[FloatArray, Point]]]:
-        """What was simulated already, with its point, by the point's identity."""
+        """Cached simulations with their points, by the identity of the point."""
         return {}
 
     def _simulated(self, point: Point) -> tuple[FloatArray, Point]:
@@ -123,10 +123,10 @@ class HeldOut:
         return self._known[id(point)][1]
 
     def _simulate(self, point: Point) -> tuple[FloatArray, Point]:
-        """The same, simulated anew.
+        """The same without the cache.
 
-        The periodic solution over the whole recording is another one than over the fitted part, so the free motion
-        is fitted again, to the fitted part alone.
+        The periodic solution over the whole recording differs from that over the fitted part, so the free motion is
+        fitted anew, to the fitted part only.
         """
         point, part = self._up_to_split(point)
         problem = Problem(self.system, part, self.signals.sensor_index, self.noise)
@@ -156,8 +156,7 @@ class HeldOut:
     def compare(self, before: Fit, after: Fit) -> HeldOutComparison:
         """Two fits on the held-out part.
 
-        Where laws follow the sensors' motion, along that motion: unmeasured forces take a free run astray, however
-        good the model.
+        With process noise, along the measured motion: unmeasured forces make any free run diverge from the measurement.
         """
         if not before.noise.process_noise:
             first, second = self._residuals(*self.runs(before.point, after.point))
@@ -170,7 +169,7 @@ class HeldOut:
         return HeldOutComparison(gain, apart, scatter, self.rules.selection.refuted)
 
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
-        """Whitened residual of the held-out part under a fit's own noise, and its log determinant."""
+        """Whitened residual of the held-out part along the smoothed motion, and its log determinant."""
         problem = Problem(self.system, self.later, self.signals.sensor_index, fit.noise)
         point, working = along_measured_motion(problem, replace(fit.point, warm_start=()))
         shown, forward, _ = problem.predict(point, working.inputs)
@@ -178,9 +177,9 @@ class HeldOut:
         return working.whitener(self.later.sensors - shown - free, self.later), working.whitener.log_det
 
     def _up_to_split(self, point: Point) -> tuple[Point, Part]:
-        """The inputs as measured, but where laws follow the sensors' motion up to the split: smoothed until there.
+        """The measured inputs, with process noise smoothed up to the split; and the point.
 
-        With the point, whose warm start are then the laws' forces along that motion.
+        Its warm start then holds the laws' forces along the smoothed motion.
         """
         signals = self.signals
         follower = Problem(self.system, self.tracked, signals.sensor_index, self.noise)
@@ -195,10 +194,10 @@ class HeldOut:
     def _free_run(
         self, problem: Problem, forward: Forward, state: FloatArray, rest: FloatArray, number: int
     ) -> tuple[ComplexArray, LawForces | None, FloatArray]:
-        """Shown sensor signals (F, S) and the laws' forces of a run that is free from the split on, in one round.
+        """One round: shown sensor signals (F, S) and laws' forces of a run that is free from the split on.
 
-        Forces that follow the sensors until there tell the state from which the run goes on in the next.  rest: what
-        the state lacks of that beside which the laws' part begins at rest; it comes back as this round has it.
+        Forces along the measured motion up to the split determine the state from which the next round continues.
+        rest: offset of the state (2n + b,) for laws' responses that begin at rest; returned as of this round.
         """
         balance = forward.harmonic_balance(state)
         if balance is None:
@@ -210,7 +209,7 @@ class HeldOut:
         else:
             forces = forward.law_forces(state, _SETTLED)
             assert forces is not None
-            if not forces.converged and not forward.plant.floats:  # those never forget
+            if not forces.converged and not forward.plant.floats:  # unconstrained systems have no fading memory
                 if number < _MARCHED:
                     force, rest = march_from_rest(forward, state + rest)
                 else:
@@ -225,7 +224,7 @@ class HeldOut:
         return FreeRun(simulated, measured, per_sensor, point)
 
     def _residuals(self, *runs: FreeRun) -> list[FloatArray]:
-        """Errors of free runs, weighed by the noise as the model of the first one passes it on, each (2 F S,)."""
+        """Errors of free runs, whitened by the noise through the first model, each (2 F S,)."""
         problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise)
         whitener = Whitener.of(problem.forward(runs[0].point), self.noise)
         residuals = []

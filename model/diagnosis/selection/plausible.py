@@ -1,9 +1,8 @@
-"""Values that a law cannot have in earnest: what has them is not named as physics, however well it fits.
+"""Plausibility of values: laws with implausible values are not named as findings, however well they fit.
 
-A knee that the motion passes within one sample is a jump, and so is friction; a sensor that shows six times the truth
-and a body of 2.7 times its mass stand for something else, and so does a part of the structure beside which a spring is
-left with a tenth of its stiffness; a periodic force at a multiple of the excitation's own
-frequency is what anything non-linear answers with.
+A knee that the motion passes within one sample is indistinguishable from friction.  A sensor gain of six, a body of 2.7
+times its mass, and a structural part beside which a spring keeps a tenth of its stiffness stand for something else.  A
+periodic force at a multiple of the excitation's frequency is the response of some non-linearity.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from sprung.model.system import System
 
 
 def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, before: Fit | None = None) -> str | None:
-    """Why a fitted term is not believed, in words; None: nothing speaks against it.
+    """Reason to doubt a fitted term, in words; None if there is none.
 
     before: the model without it, where that is known.
     """
@@ -30,7 +29,7 @@ def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, befo
     if reason is not None:
         return reason
     if isinstance(term.law, ElementLaw) and term.law.corner is not None and _saturates(fit, term, rules):
-        return "its corner is as wide as the rates of the motion: a damper that saturates"
+        return "its transition is as wide as the rates of the motion, which is a saturating damper"
     if isinstance(term.law, ElementLaw) and term.law.knees:
         return _unresolved(fit, term, rules)
     if isinstance(term.law, (BodyLaw, StructureLaw)) and term.law.adds_motion:
@@ -41,27 +40,31 @@ def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, befo
 
 
 def _unheard(grid: Grid, term: Term) -> str | None:
-    """A resonance above all that is compared: below it nothing parts it from a body that is heavier or softer."""
+    """A resonance above the compared band; below it, it is indistinguishable from a heavier or softer body."""
     if "frequency" not in term.law.names:
         return None
     highest = grid.omega[grid.band][-1] / (2 * np.pi)
     frequency = term.parameters[term.law.names.index("frequency")]
-    return f"{frequency:.3g} Hz is above the {highest:.3g} Hz that are compared" if frequency > highest else None
+    return (
+        f"{frequency:.3g} Hz is above the compared band, which ends at {highest:.3g} Hz"
+        if frequency > highest
+        else None
+    )
 
 
 def _too_slow(system: System, term: Term, rules: PlausibleRules) -> str | None:
-    """An elastic mode far below what bodies do on their springs: above it nothing parts it from a lighter body."""
+    """An elastic mode far below the modes of the suspension; above it, it is indistinguishable from a lighter body."""
     if not isinstance(term.law, BodyLaw) or "frequency" not in term.law.names:
         return None
     slowest = slowest_mode(system, RULES.record.held)
     frequency = term.parameters[term.law.names.index("frequency")]
     if frequency >= rules.slow_mode * slowest:
         return None
-    return f"{frequency:.3g} Hz is far below the {slowest:.3g} Hz of bodies on their springs"
+    return f"{frequency:.3g} Hz is far below the slowest mode of the suspension, {slowest:.3g} Hz"
 
 
 def out_of_range(term: Term) -> str | None:
-    """A parameter beyond what it can be in earnest."""
+    """A parameter outside its plausible range, in words; None if there is none."""
     for spec, value in zip(term.law.parameters, term.parameters, strict=True):
         low, high = spec.plausible
         if not low <= value <= high:
@@ -71,9 +74,9 @@ def out_of_range(term: Term) -> str | None:
 
 
 def displaced_spring(before: Fit, fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
-    """A spring far from nominal beside a linear part, and not without it: the part imitates what is missing elsewhere.
+    """A spring far from nominal with a linear part, but not without it: the part imitates something else.
 
-    What yields or slips may well take a spring's place; what is linear leaves it the static load.
+    A law that yields or slips may replace a spring; a linear part leaves it the static load.
     """
     law = term.law
     linear = isinstance(law, (BodyLaw, StructureLaw)) or (isinstance(law, ElementLaw) and law.memory_decay is not None)
@@ -87,9 +90,9 @@ def displaced_spring(before: Fit, fit: Fit, term: Term, rules: PlausibleRules = 
 
 
 def hardly_there(fit: Fit, rules: PlausibleRules = RULES.plausible, index: int = -1) -> bool:
-    """Whether a term of a fit, the last by default, does not differ from its absence by its stated deviation.
+    """Whether a term with one parameter does not differ significantly from its absence; by default the last term.
 
-    Of terms with one parameter.
+    Of other terms: never.
     """
     term = fit.point.terms[index]
     if len(term.parameters) != 1 or not np.isfinite(term.law.absent[0]):
@@ -100,14 +103,14 @@ def hardly_there(fit: Fit, rules: PlausibleRules = RULES.plausible, index: int =
 
 
 def _saturates(fit: Fit, term: Term, rules: PlausibleRules) -> bool:
-    """Whether a force that should change its sign at once does so over most of the rates that there are."""
+    """Whether the transition of a friction extends over most of the rates of the motion."""
     corner = term.element_law.corner
     rate = fit.element_motion[1] @ term.port(fit.forward.system)
     return corner is not None and term.parameters[corner] > rules.corner * float(np.std(rate))
 
 
 def _unresolved(fit: Fit, term: Term, rules: PlausibleRules) -> str | None:
-    """A knee of the rate that no sample of the motion resolves."""
+    """A knee over the rate that the sampling of the motion does not resolve."""
     rate = fit.element_motion[1] @ term.port(fit.forward.system)
     passed = reversal_step(rate[:: len(rate) // fit.forward.part.grid.samples])
     for index in term.element_law.knees:
@@ -131,12 +134,12 @@ def harmonic(part: Part, term: Term, rules: PlausibleRules = RULES.plausible) ->
             1 <= multiple <= rules.harmonics
             and abs(frequency - multiple * line) * part.grid.length < rules.close + 0.5 * multiple
         ):
-            return f"{frequency:.4g} Hz is {multiple} times the excitation's own {line:.4g} Hz"
+            return f"{frequency:.4g} Hz is {multiple} times a frequency of the excitation, {line:.4g} Hz"
     return None
 
 
 def excitation_lines(part: Part, rules: PlausibleRules = RULES.plausible) -> list[float]:
-    """Frequencies (Hz) of an excitation that consists of a few lines; none where it is broad."""
+    """Frequencies, Hz, of an excitation that consists of a few lines; empty if it is broadband."""
     found: list[float] = []
     omega = part.grid.omega[:, None]
     for spectrum in (*(1j * omega * part.support).T, *part.force.T):

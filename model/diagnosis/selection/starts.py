@@ -1,4 +1,4 @@
-"""Where fits of a candidate begin: as it was screened, as everything else moving along has it, and at look-alikes."""
+"""Initial values of candidates: as screened, after a joint linear step of all parameters, and at look-alikes."""
 
 from __future__ import annotations
 
@@ -18,25 +18,27 @@ from sprung.model.laws.base import FittedElement, Restart
 
 
 def starts_of(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
-    """Starts of a candidate beside the present model, the first one the likeliest."""
+    """Initial values of a candidate beside the present model, the most promising first."""
     if candidate.start is not None:
         return [candidate.start]
     if isinstance(candidate.term.law, StructureLaw):
         return structure_starts(problem, base, candidate)
     starts = [joint_start(problem, base, candidate), *_further_starts(problem, base, candidate)]
-    if _astray(problem, base) and _strengths(candidate.term.law):  # what a gross law drove the parameters to
+    if _astray(problem, base) and _strengths(
+        candidate.term.law
+    ):  # parameters far off nominal have absorbed a gross law
         starts.append(joint_start(problem, base, candidate, nominal=True))
     return starts
 
 
 def _astray(problem: Problem, base: Fit) -> bool:
-    """Whether parameters are far off nominal."""
+    """Whether any parameter is far off nominal."""
     far: float = np.max(np.abs(base.point.theta), initial=0.0)
     return far > problem.rules.selection.far
 
 
 def start_of(base: Fit, candidate: Candidate) -> Point:
-    """The present model with the candidate's term; the first Gauss-Newton step moves the rest."""
+    """The present model with the candidate's term added; other values are left to the first Gauss-Newton step."""
     point = base.point
     state = point.state
     law = candidate.term.law
@@ -52,9 +54,9 @@ def start_of(base: Fit, candidate: Candidate) -> Point:
 
 
 def structure_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
-    """Starts of a part of the structure: as screened, and as everything moving along has it.
+    """Initial values of a structural part: as screened, and after a joint step.
 
-    The same at nominal parameters, where the present ones are far off: what a gross part drove them to.
+    If the present parameters are far off nominal, having absorbed a gross part, also after a step from nominal.
     """
     starts = []
     for nominal in (False, True)[: 2 if _astray(problem, base) else 1]:
@@ -66,14 +68,14 @@ def structure_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[
 
 
 def _further_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
-    """Starts at other values of the element than those that were read without the law."""
+    """Initial values with an element's stiffness or damping other than estimated without the law."""
     law, names = candidate.term.law, [p.name for p in problem.system.parameters]
     at = {quantity: f"{candidate.location}.{quantity}" for quantity in ("stiffness", "damping")}
     if not isinstance(law, ElementLaw) or at["damping"] not in names:
         return []
     start = start_of(base, candidate)
     restarts = () if law.restarts is None else law.restarts(_reading(problem, base, candidate.location))
-    if candidate.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
+    if candidate.beyond > 1.0:  # a law proportional to the damper that exceeds it: the damper is stronger
         stronger = problem.rules.selection.stronger
         values = law.scaled(candidate.term.parameters, 1 / stronger)
         restarts += (Restart(1.0, stronger * candidate.beyond, tuple(values)),)
@@ -98,7 +100,7 @@ def _reading(problem: Problem, base: Fit, location: str) -> FittedElement:
 
 
 def alike_starts(base: Fit, candidate: Candidate) -> list[Point]:
-    """Starts at other parameters of the same law that look alike on the whole."""
+    """Initial values at other parameters of the same law with a similar force."""
     law = candidate.term.law
     if not isinstance(law, ElementLaw) or law.alike is None:
         return []
@@ -107,10 +109,10 @@ def alike_starts(base: Fit, candidate: Candidate) -> list[Point]:
 
 
 def joint_start(problem: Problem, base: Fit, candidate: Candidate, nominal: bool = False) -> Point:
-    """The term at the strength that, with everything else moving along, the base's residual asks for.
+    """The term with the strength of a joint linear step of all parameters on the base's residual.
 
-    The strength of a law is found from a hint of it, its shape kept: at its full strength beside unmoved parameters,
-    which have absorbed much of it, the model may be too far away for a first step.  nominal: from nominal parameters.
+    The step is taken at a fraction of the law's strength with its shape kept, since the other parameters have absorbed
+    much of it, and the full law beside them may be too far away for a linear step.  nominal: from nominal parameters.
     """
     if problem.memory is None:
         return _joint_start(problem, base, candidate, nominal)
@@ -151,7 +153,7 @@ def _joint_start(problem: Problem, base: Fit, candidate: Candidate, nominal: boo
 
 
 def _strengths(law: Law) -> tuple[int, ...]:
-    """Parameters that a law's effect grows with, the rest of its shape kept; none: there are no such."""
+    """Indices of the parameters that scale a law's effect at constant shape; empty if there are none."""
     if isinstance(law, StructureLaw):
         return law.strengths
     if isinstance(law, ElementLaw) and law.strength is not None and law.named:
@@ -160,7 +162,7 @@ def _strengths(law: Law) -> tuple[int, ...]:
 
 
 def _hint(term: Term, share: float) -> Term | None:
-    """A term at a share of its strength; None: its law has none."""
+    """A term at a share of its strength; None if its law has no strength."""
     law, strengths = term.law, _strengths(term.law)
     if not strengths:
         return None
@@ -170,7 +172,7 @@ def _hint(term: Term, share: float) -> Term | None:
 
 
 def _void(term: Term) -> bool:
-    """Whether a joint step has taken a law to a bound; a part of the structure: all that there is of it."""
+    """Whether a joint step has driven a law to a bound; of structural parts: in all their strengths."""
     if isinstance(term.law, StructureLaw):
         return not any(term.parameters[i] for i in term.law.strengths)
     return term.bounded

@@ -84,11 +84,13 @@ def test_a_formula_that_leaves_more_than_noise_makes_way_for_names_that_leave_le
     assert (chosen.found == VALVE_AND_STOP) is taken
 
 
-@pytest.mark.parametrize(("worth", "noisy", "counts"), [(90.0, True, True), (90.0, False, False), (40.0, True, False)])
+@pytest.mark.parametrize(
+    ("reduction", "noisy", "counts"), [(90.0, True, True), (90.0, False, False), (40.0, True, False)]
+)
 def test_a_small_second_law_counts_where_it_explains_most_of_what_is_no_noise(
-    worth: float, noisy: bool, counts: bool, monkeypatch: pytest.MonkeyPatch
+    reduction: float, noisy: bool, counts: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(minor, "leaves_more_than_noise", lambda state: noisy)
     state: Any = SimpleNamespace(options=Options(), fit=SimpleNamespace(chi_square=100.0))
-    found: Any = SimpleNamespace(worth=worth)
+    found: Any = SimpleNamespace(reduction=reduction)
     assert minor._explains_most_of_the_rest(state, found) is counts

@@ -41,11 +41,11 @@ def test_what_could_lead_is_fitted_on_while_it_gets_further(
         fit: Any = FallingFit(one.fit.left)
         return replace(one, fit=fit, evidence=one.evidence + step)
 
-    monkeypatch.setattr(compete, "_finished", fitted_on)
+    monkeypatch.setattr(compete, "_converged_fit", fitted_on)
     problem: Any = SimpleNamespace(work=None, process_noise=True, rules=RULES)
     base: Any = None
     done: Any = FallingFit(0.0, converged=True)
     settled = replace(trial(100.0, 0.0), fit=done)
-    order = compete._settled(problem, base, [settled, trial(60.0, 50.0)])
+    order = compete._with_unconverged_refitted(problem, base, [settled, trial(60.0, 50.0)])
     assert len(tried) == calls
     assert order[0].evidence == leading

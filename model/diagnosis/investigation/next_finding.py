@@ -1,0 +1,160 @@
+"""One step of an investigation: the competing candidates, the accepted one, and the model refitted with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.baseline import refreshed, settled
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.calibration import (
+    calibrated,
+    with_free_gains,
+    within_data_sheet,
+    without_calibrations,
+)
+from sprung.model.diagnosis.investigation.formula_trial import with_formula
+from sprung.model.diagnosis.investigation.minor import is_minor, untried
+from sprung.model.diagnosis.investigation.setup import misfit
+from sprung.model.diagnosis.investigation.state import Found, Investigation, Progress
+from sprung.model.diagnosis.investigation.surface import with_surface
+from sprung.model.diagnosis.investigation.widened import (
+    adopt_wider,
+    best_wider,
+    is_better,
+    share_an_element,
+    with_wider_rivals,
+    with_wider_tried,
+)
+from sprung.model.diagnosis.screening.score import Candidate
+from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
+from sprung.model.diagnosis.selection.plausible import doubt, hardly_there
+
+
+@dataclass(frozen=True)
+class _Competition:
+    """Fitted candidates of one step, sorted out."""
+
+    believed: list[Trial]  # all with plausible values, whether findings or not
+    findings: list[Trial]  # of these, the ones whose evidence makes them findings
+    leading: list[Trial]  # the findings in order of preference
+    implausible: list[tuple[Trial, str]]  # of more evidence than any finding, with the reason for doubt
+
+
+def next_finding(state: Investigation, number: int, tell: Progress) -> Investigation:
+    """The investigation with one more finding; without one if the residual is noise or no candidate is accepted."""
+    candidates = _candidates(state)
+    if candidates or share_an_element(state):
+        state = with_wider_tried(state)
+    wide = best_wider(state)
+    promised = max((candidate.score for candidate in candidates), default=0.0)
+    if wide is not None and wide.fall > promised and is_better(state, wide, []):
+        return next_finding(adopt_wider(state, wide), number, tell)
+    if not candidates:
+        return state
+    share = 0.25 + 0.17 * number
+    competition = _competition(state, candidates, lambda text: tell(share, text))
+    state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in competition.implausible)))
+    if wide is not None and is_better(state, wide, competition.leading):
+        return next_finding(adopt_wider(state, wide), number, tell)
+    if not competition.leading:
+        return state
+    tell(share + 0.08, f"checking {competition.leading[0].term.location}")
+    trials, note = with_formula(state, competition.findings, competition.leading)
+    chosen = trials[0]
+    p_value = _p_value(state, chosen)
+    if _is_refuted(state, chosen) or p_value > state.options.rules.acceptance.alpha:
+        return state
+    if state.calibrations is None and within_data_sheet(state, chosen.term, instruments=2):
+        state = calibrated(state, chosen.term)
+        if state.calibrations:
+            return state
+    second = runner_up(state.problem, state.fit, untried(state, state.last.candidates), chosen, competition.believed)
+    state, trial = _refitted(state, chosen, trials)
+    rivals = tuple(t for t in trials if t is not trial)
+    found = Found(trial, rivals, second, p_value, tuple(t for t, _ in competition.implausible))
+    tell(share + 0.12, "screening the residual")
+    last = screen(state.problem, state.fit, state.problem.system.catalogue, state.options.project)
+    return replace(state, found=(*state.found, found), last=last, notes=(*state.notes, *note))
+
+
+def _candidates(state: Investigation) -> list[Candidate]:
+    """The candidates of the last screening that are worth a fit."""
+    options, rules = state.options, state.options.rules
+    error = float(np.sqrt(np.mean(misfit(state.fit))))
+    gross = not state.problem.process_noise and error > rules.selection.gross
+    screening = without_calibrations(state)
+    return untried(state, shortlist(screening, rules.acceptance.alpha, options.multiplicity, rules, gross=gross))
+
+
+def _competition(state: Investigation, candidates: list[Candidate], tell: Callable[[str], None]) -> _Competition:
+    """All candidates fitted, and which of them are findings."""
+    rules = state.options.rules
+    tried = with_wider_rivals(state, compete(state.problem, state.fit, candidates, tell))
+    doubts = [(trial, doubt(trial.fit, trial.term, rules.plausible, before=state.fit)) for trial in tried]
+    believed = [trial for trial, reason in doubts if reason is None]
+    present = [trial for trial in tried if not hardly_there(trial.fit, rules.plausible)]
+    worthy = [t for t in present if t.finished and t.evidence > 0 and not is_minor(state, t)]
+    findings = [t for t in worthy if _contains(believed, t)]
+    leading = preferred(findings, rules.selection)
+    leading.sort(key=lambda t: t.candidate.family.rank)  # faults of the inputs first, of forces as of motions
+    best = max((trial.evidence for trial in leading), default=-np.inf)
+    implausible = [(t, reason) for t, reason in doubts if reason and t.evidence > best and _contains(worthy, t)]
+    return _Competition(believed, findings, leading, implausible)
+
+
+def _contains(trials: list[Trial], trial: Trial) -> bool:
+    """Whether a list contains this very trial: fits are compared by identity."""
+    return any(trial is one for one in trials)
+
+
+def _p_value(state: Investigation, chosen: Trial) -> float:
+    """Chance of the chosen trial under noise alone, by its fit and by its score, corrected for all tests."""
+    tests = state.last.tried(chosen.candidate.family) if state.options.multiplicity else 1
+    return max(chosen.p_value(tests), min(1.0, chosen.candidate.p_single * tests))
+
+
+def _is_refuted(state: Investigation, chosen: Trial) -> bool:
+    """Whether the held-out part refutes a trial; not where it hardly moves, or is not asked."""
+    if not state.options.held_out or state.held.still:
+        return False
+    return state.held.compare(state.fit, chosen.fit).refuted
+
+
+def _implausible_note(trial: Trial, reason: str) -> str:
+    name = trial.term.law.name.replace("_", " ")
+    return f"{name} at {trial.term.location} fits better, but is implausible and not named: {reason}"
+
+
+def _refitted(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple[Investigation, Trial]:
+    """The model with the chosen law and noise levels estimated anew, and the variant of the law that fits best then."""
+    fit = chosen.fit if chosen.named else _with_surface(state, chosen.fit)
+    problem, fit = refreshed(state.problem, with_free_gains(state, fit))
+    state = replace(state, problem=problem, fit=fit)
+    trial, fit = _variant(state, chosen, trials)
+    if not fit.converged and not problem.process_noise:
+        problem, fit = refreshed(problem, settled(problem, fit))
+    return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise)), trial
+
+
+def _variant(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple[Trial, Fit]:
+    """The best variant of the chosen law at the noise estimated with it; at a higher level they were equivalent."""
+    best = chosen, state.fit
+    for rival in trials:
+        if rival is not chosen and rival.term.key[:2] == chosen.term.key[:2] and rival.named:
+            fit = try_optimise(state.problem, with_free_gains(state, rival.fit).point, 6, state.fit.whitener)
+            extra_cost = (rival.gain - rival.evidence) - (best[0].gain - best[0].evidence)
+            if fit is not None and best[1].deviance - fit.deviance > extra_cost:
+                best = rival, fit
+    return best
+
+
+def _with_surface(state: Investigation, fit: Fit) -> Fit:
+    """The fit with its unnamed force as an estimated surface, if that predicts the held-out part better."""
+    surface = with_surface(state.problem, fit)
+    if surface is None:
+        return fit
+    return surface if state.held.compare(fit, surface).gain > 0 else fit
