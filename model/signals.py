@@ -156,6 +156,8 @@ class Estimate:
     informative: bool = True  # False: too little excitation to tell anything, neither that it fits nor that it does not
     running: bool = False  # though it is not informative, the vehicle was moved: its windows are too noisy, or alike
     noise: float = 0.0  # share of noise in what looks like information on the parameters; 0: negligible
+    identified: bool = True  # False: there are no values, for the reason
+    reason: str | None = None  # why nothing, or not all that was asked for, was found
 
 
 @dataclass(slots=True)

@@ -23,6 +23,7 @@ MAY_IMPORT = {
 ORDER = [
     "signals",
     "chunks",
+    "work",
     "text",
     "units",
     "parameters",

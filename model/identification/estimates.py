@@ -11,13 +11,23 @@ from sprung.model.signals import Deviating, Estimate, FloatArray
 EXCITED = 20.0  # power of an input over its noise; below, what sensors show is not the response to the inputs
 
 
-def estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating | None]) -> list[Estimate]:
-    """One `Estimate` per window of a refined batch; the first P of what was refined are its parameters."""
+WITHOUT_VALUES = "cannot be simulated", "not identified"  # how reasons begin that lie with the model
+DIVERGED = f"{WITHOUT_VALUES[0]}: the forces of the model's laws leave all bounds along the measured motion"
+
+
+def estimates(
+    refined: Refined, P: int, states: bool, deviating: list[Deviating | None], limit: str = "what is allowed"
+) -> list[Estimate]:
+    """One `Estimate` per window of a refined batch; the first P of what was refined are its parameters.
+
+    limit: of the work for a window, in words.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
     fits = refined.chi_square < fit_limit(refined.freedom)
     # A window that fits and yet pins nothing down tells nothing; nor does one whose inputs stand still, whatever moves.
-    told = np.where(fits, refined.identifiable[:, :P].any(axis=1) & refined.converged, True)
+    unknown = refined.diverged | refined.ended
+    told = np.where(fits & ~unknown, refined.identifiable[:, :P].any(axis=1) & refined.converged, True)
     moved = refined.excitation > EXCITED
     informative = moved & told
     return [
@@ -37,9 +47,16 @@ def estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating 
             running=bool(moved[b] and not informative[b]),
             deviating=deviating[b],
             noise=float(refined.noise[b]),
+            identified=not unknown[b],
+            reason=DIVERGED if refined.diverged[b] else longer_than(limit) if refined.ended[b] else None,
         )
         for b in range(len(refined.log_ratio))
     ]
+
+
+def longer_than(limit: str) -> str:
+    """Why a window has no values whose search was ended."""
+    return f"{WITHOUT_VALUES[1]}: took longer than {limit}"
 
 
 def pooled_nrmse(per_sensor: FloatArray) -> float:

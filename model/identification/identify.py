@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,22 +24,33 @@ from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
 from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
+from sprung.model.work import WorkBudget
+
+NOT_EXPLAINED = "whether a measurement is wrong was not looked into to the end: it takes longer than "
+
+
+def _no_limit() -> WorkBudget:
+    return WorkBudget(clock=time.thread_time)
 
 
 @dataclass(slots=True)
 class Identifier:
-    """Identifies windows of one system.  Stateless but for `times` and cached workspaces; use one per thread.
+    """Identifies windows of one system.  Stateless but for `times`, cached workspaces and the work of the present
+    batch; use one per thread.
 
-    workers: threads that share a batch of windows (see `Refiner`).
+    workers: threads that share a batch of windows (see `Refiner`).  seconds: of processor time of this thread that a
+    window of a system with laws may take, on average over a batch; only for one worker.
     """
 
     system: System
     estimator: Estimator | None = None
     workers: int = 1
+    seconds: float = math.inf
     times: StageTimes = field(default_factory=StageTimes)
     _refiners: dict[int, Refines] = field(default_factory=dict)
     _explainers: dict[int, Explainer] = field(default_factory=dict)
     _model_uncertainty: ModelUncertainty | None = None
+    _work: WorkBudget = field(default_factory=_no_limit)
 
     @property
     def digest(self) -> str:
@@ -65,6 +77,7 @@ class Identifier:
         windows = self.system.undistorted(self._checked(windows))
         if len(windows) == 0:
             return []
+        self._work.until = time.thread_time() + self.seconds * len(windows)
         begin = time.perf_counter()
         loads = bool(self.system.loads) if explain else any(load.declared for load in self.system.loads)
         if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
@@ -91,8 +104,12 @@ class Identifier:
         if len(bad):
             for b, cause in explainer.explain(windows, bad).items():
                 (restored,) = self._estimates(cause.refined, False, cause.point)
-                told = restored.adequate and cause.corrected
-                found[b] = replace(self._averaged(restored), faults=cause.faults, adequate=told)
+                told, known = restored.adequate and cause.corrected, restored.identified or bool(cause.faults)
+                found[b] = replace(self._averaged(restored), faults=cause.faults, adequate=told, identified=known)
+            if self._work.ended:
+                for b in bad.tolist():
+                    if found[b].identified and not found[b].adequate:
+                        found[b] = replace(found[b], reason=NOT_EXPLAINED + self._limit)
         self.times = StageTimes(between - begin, time.perf_counter() - between)
         return found
 
@@ -102,7 +119,11 @@ class Identifier:
         spread = prior_std(self.system)[len(self.system.parameters) :]
         channels = len(self.system.channels)
         deviating = [_deviating(refined, b, P, channels, spread, point) for b in range(len(refined.log_ratio))]
-        return estimates(refined, P, states, deviating)
+        return estimates(refined, P, states, deviating, self._limit)
+
+    @property
+    def _limit(self) -> str:
+        return f"{self.seconds:g} s of processor time"
 
     def _with_model_uncertainty(self, estimate: Estimate) -> Estimate:
         """With what masses that are not quite those of the file, and laws between samples, leave open."""
@@ -157,7 +178,7 @@ class Identifier:
     def _refiner(self, samples: int) -> Refines:
         if samples not in self._refiners:
             if acting_laws(self.system):
-                self._refiners[samples] = LawRefiner(self.system, samples, self.workers)
+                self._refiners[samples] = LawRefiner(self.system, samples, self.workers, self._work)
             else:
                 self._refiners[samples] = Refiner(self.system.whole_system, samples, self.workers)
         return self._refiners[samples]
@@ -178,14 +199,18 @@ class Identifier:
         return windows
 
 
-def load_identifier(system: System, model: str | Path | None = None, workers: int = 1) -> Identifies:
+def load_identifier(
+    system: System, model: str | Path | None = None, workers: int = 1, seconds: float = math.inf
+) -> Identifies:
     """The system's identifier with trained weights from `model` (a directory), or the bundled ones if they fit.
+
+    seconds: of processor time that a window may take where the system has laws, see `Identifier`.
 
     Without weights for the system the refinement starts from the nominal values.  Systems on a track, or without any
     input, are identified from the spectra of their sensors (`model.ambient`), for which there is nothing to train.
     """
     if system.laws:
-        return _with_laws(system, workers)
+        return _with_laws(system, workers, seconds)
     if system.on_track:
         return AmbientIdentifier(system)
     if not system.file.inputs:
@@ -203,7 +228,7 @@ def without_weights(system: System) -> str:
     return ""
 
 
-def _with_laws(system: System, workers: int) -> Identifies:
+def _with_laws(system: System, workers: int, seconds: float) -> Identifies:
     """The identifier of a system file with laws.  Errors: `UnusableWindow` for a law that windows cannot hold."""
     if system.on_track or not system.file.inputs:
         raise UnusableWindow(f"{system.name}: laws can be tracked where the inputs are measured; leave them out")
@@ -212,7 +237,7 @@ def _with_laws(system: System, workers: int) -> Identifies:
             f"{system.name}: laws act along deflections, which accelerations alone leave open; "
             "measure the supports' displacement or velocity as well, or leave the laws out"
         )
-    return Identifier(system, None, workers)
+    return Identifier(system, None, workers, seconds)
 
 
 def identifiability(system: System, seed: int = 0) -> FloatArray:

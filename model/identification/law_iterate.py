@@ -109,7 +109,8 @@ class NormalEquations:
         """Cost (B,) with the initial state profiled out, steps of unknowns (B, U) and of that state alone (B, N).
 
         residual: whitened, (B, K, 1); unknowns: current values, (B, U), with the prior around 0.  Far from a fit the
-        residual counts as noise, so that the prior holds weakly determined unknowns.
+        residual counts as noise, so that the prior holds weakly determined unknowns.  A window without finite steps has
+        an infinite cost and stays where it is.
         """
         along = self.free @ residual
         part = torch.cholesky_solve(along, self.factor)
@@ -118,7 +119,10 @@ class NormalEquations:
         noise = (cost / residual.shape[1]).clamp_min(1.0)[:, None]
         held = torch.linalg.inv(self.information + torch.diag_embed(noise * self.precision))
         step = held @ (gradient - (noise * self.precision * unknowns).unsqueeze(2))
-        return cost, step.squeeze(2), part.squeeze(2) / self.free_scale
+        step, alone = step.squeeze(2), part.squeeze(2) / self.free_scale
+        sound = torch.cat([cost[:, None], step, alone], dim=1).isfinite().all(dim=1)
+        here = sound[:, None]
+        return cost.where(sound, torch.inf), step.where(here, 0.0), alone.where(here, 0.0)
 
     def state_step(self, state_alone: Tensor, step: Tensor) -> Tensor:
         """Step of the initial state (B, N) that goes with a step of the unknowns (B, U)."""

@@ -25,6 +25,7 @@ from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.noise_share import mean_share, noise_share
 from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WEAK_STD, Refined
 from sprung.model.signals import FloatArray
+from sprung.model.work import WorkBudget
 
 ITERATIONS = 6
 _CONVERGED = 0.3  # standard deviations: a second step this small leaves a far smaller error
@@ -78,7 +79,8 @@ class LawSearch:
     """Search over windows with the same sensors present, from log-ratios (B, P + law parameters) and loads of zero.
 
     wanted: windows (B,) for which the evidence on gains and delays is computed; weighs: whether it is computed for any
-    window of the whole batch, of which this is a piece: the results of all pieces then have room for it.
+    window of the whole batch, of which this is a piece: the results of all pieces then have room for it.  work: when it
+    has ended, no window is iterated any more.
     """
 
     def __init__(
@@ -89,8 +91,9 @@ class LawSearch:
         start: FloatArray,
         wanted: Tensor,
         weighs: bool,
+        work: WorkBudget,
     ) -> None:
-        self.windows, self.calibration, self.data, self.wanted = windows, calibration, data, wanted
+        self.windows, self.calibration, self.data, self.wanted, self.work = windows, calibration, data, wanted, work
         B, U, T, N = len(start), windows.unknowns, windows.model.samples, windows.model.states_count
         self.reported, H = windows.reported, len(calibration.deviations) if weighs else 0
         unknowns = torch.zeros(B, U, dtype=torch.float64)
@@ -102,6 +105,7 @@ class LawSearch:
         self.squares = self.cost.clone()  # sums of squares by which iterates are compared
         self.covariance = torch.eye(U, dtype=torch.float64).repeat(B, 1, 1)
         self.converged = torch.zeros(B, dtype=torch.bool)
+        self.diverged = torch.zeros(B, dtype=torch.bool)
         self.iterations = torch.zeros(B, dtype=torch.long)
         self.error = torch.full((B, len(data.present)), torch.nan, dtype=torch.float64)
         self.states = torch.zeros(B, T, N, dtype=torch.float64)
@@ -113,12 +117,14 @@ class LawSearch:
 
     def run(self, states: bool, near: bool = False, iterations: int = ITERATIONS) -> Refined:
         """Iterate until every window has converged, or `iterations` times; near: the start is known to be good."""
-        active = self._start(torch.arange(len(self.cost)), last=iterations == 1)
-        if not near and len(active) and iterations > 1:  # again, from the median of what that led to
+        active = torch.arange(len(self.cost))
+        if not self.work.ended:
+            active = self._start(active, last=iterations == 1)
+        if not near and len(active) and iterations > 1 and not self.work.ended:  # again, from the median of that
             self.point.unknowns[active] = self.point.unknowns.median(dim=0).values
             active = self._start(active, last=False)
         for left in reversed(range(iterations - 1)):
-            if len(active) == 0:
+            if len(active) == 0 or self.work.ended:
                 break
             self._iterate(active, last=left == 0)
             active = active[~self.converged[active]]
@@ -151,14 +157,15 @@ class LawSearch:
         going = (improved & ~stationary & ~worse & ~second.small(std)).nonzero().squeeze(1)
         if len(going):  # the normal equations are good enough for one more
             self._third_step(going, second, normal.take(going), near.take(going), data.take(going))
-        done = ((second.small(std) & improved) | stationary) & ~worse & ~motion.diverged & ~second.motion.diverged
+        done = ((second.small(std) & improved) | stationary) & ~worse & cost.isfinite()
+        done &= ~motion.diverged & ~second.motion.diverged
         _, diverged = torch.linalg.cholesky_ex(normal.covariance)  # not positive definite where the motion has diverged
         sane = (diverged == 0) & second.squares.isfinite()
         due = ((done | last) & sane & self.wanted[rows]).nonzero().squeeze(1)
         if len(due):
             weighed = steps.take(due), tangent.take(due), second.take(due), data.take(due)
             self._weigh(rows[due], normal.take(due), *weighed)
-        more, motion = self._limited(second.step), second.motion
+        more, motion, lost = self._limited(second.step), second.motion, motion.diverged
         forward = second.point.stepped(more, normal.state_step(second.state_alone, more))
         forward = forward.where(improved, point.stepped(step / 3, dx0 / 3))
         best = self.best.take(rows)
@@ -173,6 +180,7 @@ class LawSearch:
                 w, normal.take(ended), steps.take(ended), tangent.take(ended), data.present
             )
         self.converged[rows], self.covariance[rows], self.states[rows] = done, covariance, motion.states
+        self.diverged[rows] = lost
         self.iterations[rows] += 1
         shown = torch.as_tensor(np.flatnonzero(data.present))
         self.outputs[rows[:, None], :, shown] = motion.outputs.mT
@@ -244,7 +252,8 @@ class LawSearch:
         both = identifiable[:, :, None] & identifiable[:, None, :]
         prior = torch.eye(self.reported, dtype=torch.float64) * PRIOR_STD**2
         prior[w.linear, w.linear] = 1 / w.model.precision[: len(w.linear)]
-        B = len(found)
+        B, ended = len(found), ~self.converged & self.work.ended
+        diverged = (self.diverged | ~self.cost.isfinite()) & ~self.converged & ~ended
         rms = np.full((B, len(data.present)), np.nan)
         rms[:, data.present] = data.measured.square().mean(dim=1).sqrt()
         return Refined(
@@ -265,4 +274,6 @@ class LawSearch:
             information=(self.information / chi_square.clamp_min(1)[:, None, None]).numpy(),
             score=(self.score / chi_square.clamp_min(1)[:, None]).numpy(),
             noise=share,
+            diverged=diverged.numpy(),
+            ended=ended.numpy(),
         )

@@ -70,6 +70,8 @@ class Refined:
     information: FloatArray  # on the deviations, shape (B, H, H)
     score: FloatArray  # slope of the log-likelihood along them, shape (B, H)
     noise: FloatArray  # share of noise in what looks like information on parameters; 0: negligible, shape (B,)
+    diverged: BoolArray  # whether the motion under the laws left all bounds, shape (B,)
+    ended: BoolArray  # whether the work that was allowed ended first, shape (B,)
 
     def take(self, at: IntArray) -> Refined:
         """The windows `at` of the batch."""
@@ -273,6 +275,8 @@ class Refiner:
             information=(progress.information[rows] / chi_square.clamp_min(1)[:, None, None]).numpy(),
             score=(progress.score[rows] / chi_square.clamp_min(1)[:, None]).numpy(),
             noise=noise,
+            diverged=np.zeros(len(x), dtype=bool),
+            ended=np.zeros(len(x), dtype=bool),
         )
 
 

@@ -24,6 +24,7 @@ from sprung.model.laws import ElementLaw, SensorLaw, StructureLaw
 from sprung.model.laws.in_place import is_linear
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
+from sprung.model.work import WorkBudget
 
 _CHUNK = 96  # windows times laws that are processed together: memory grows with both
 _PILOT_WINDOWS = 8  # windows that are identified first to start the others, in batches of at least
@@ -69,8 +70,11 @@ def without_laws(system: System) -> System:
 class LawRefiner:
     """Gauss-Newton for one system with laws and one window length; see `model.identification.refine.Refiner`."""
 
-    def __init__(self, system: System, samples: int | None = None, workers: int = 1) -> None:
-        self.system, self.workers = system, workers
+    def __init__(
+        self, system: System, samples: int | None = None, workers: int = 1, work: WorkBudget | None = None
+    ) -> None:
+        """work: where it has ended windows are left as they are."""
+        self.system, self.workers, self.work = system, workers, work or WorkBudget()
         self.laws, bare = acting_laws(system), without_laws(system)
         self.model = WindowModel(bare, samples or system.window)
         self.calibration = DeviationSensitivity(self.model)
@@ -97,10 +101,11 @@ class LawRefiner:
         model = self._with(loads)
 
         def work(at: IntArray) -> Refined:
-            with torch.no_grad():
+            # forces that leave all bounds are told as such
+            with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
                 data = self.model.batch(self.model.knots(windows[at]), windows[at], present[at[0]])
                 asked = torch.as_tensor(wanted[at]), bool(wanted.any())
-                search = LawSearch(model, self.calibration, data, begin[at], *asked)
+                search = LawSearch(model, self.calibration, data, begin[at], *asked, self.work)
                 found = search.run(states, near, iterations)
                 return replace(found, excitation=self.model.excitation(windows[at]))
 

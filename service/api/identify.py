@@ -87,7 +87,7 @@ def _answer(engine: Engine, vehicle: str | None, estimate: Estimate) -> dict[str
         "model": engine.digest,
         "parameters": _parameters(engine, solved.log_ratio, solved.std, estimate.identifiable.tolist()),
         "fit": fit_dict(solved.nrmse, sensor_dict(engine, solved.per_sensor))
-        | {"adequate": solved.adequate, "converged": solved.converged},
+        | {"adequate": solved.adequate, "converged": solved.converged, "reason": estimate.reason},
     }
     if estimate.states is not None:
         answer["states"] = dict(zip(state_names(engine), estimate.states.T.tolist(), strict=True))

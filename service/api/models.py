@@ -36,6 +36,7 @@ class FitAnswer(BaseModel):
     per_sensor: dict[str, float]
     adequate: bool | None = Field(default=None, description="the window fits the model within its noise")
     converged: bool | None = None
+    reason: str | None = Field(default=None, description="why nothing, or not all that was asked for, was found")
 
 
 class WindowParameter(BaseModel):
@@ -359,7 +360,7 @@ class Trace(BaseModel):
 
     unit: str
     measured: list[float | None]
-    simulated: list[float]
+    simulated: list[float | None]
     residual: list[float | None]
     nrmse: float | None
 
@@ -371,6 +372,7 @@ class WindowAnswer(BaseModel):
     start: str
     sample_rate: float
     adequate: bool
+    reason: str | None = Field(description="why nothing, or not all that was asked for, was found")
     sensors: dict[str, Trace]
 
 

@@ -92,8 +92,9 @@ async def vehicle_bundle(
         excerpt = await run_in_threadpool(core.alarm_signals.load, found.stretch, id_, system)
     windows = list(whole_windows(served.engine, excerpt))
     compared: list[Compared] = []
-    for first in range(0, len(windows), AT_ONCE):  # in parts: windows that come live have their turn between them
-        part = windows[first : first + AT_ONCE]
+    while windows:  # in parts: windows that come live have their turn between them
+        at_once = core.pipeline.pace.windows(served, AT_ONCE)
+        part, windows = windows[:at_once], windows[at_once:]
         some = core.pipeline.compute_of(served).submit(partial(compare_all, served.engine, part), Priority.REQUEST)
         simulated = await asyncio.wrap_future(some)
         compared += simulated
@@ -198,6 +199,7 @@ def window_dict(system: Any, vehicle: str, found: Compared) -> dict[str, Any]:
         "start": to_iso(found.start),
         "sample_rate": found.sample_rate,
         "adequate": bool(found.estimate.adequate),
+        "reason": found.estimate.reason,
         "sensors": sensors,
     }
 

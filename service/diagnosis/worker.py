@@ -35,8 +35,8 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     one_thread_each()  # candidates are fitted beside each other
     hand_over_often()
     from sprung.model.diagnosis.api import Options, diagnose
-    from sprung.model.diagnosis.fit.work import WorkBudget
     from sprung.model.diagnosis.rules import RULES
+    from sprung.model.work import WorkBudget
     from sprung.service.diagnosis.improved import write_improved
     from sprung.service.report import write_report
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import msgpack
@@ -60,7 +60,9 @@ class WindowEstimate:
 
     @classmethod
     def of(cls, window: Window, estimate: Estimate | None) -> WindowEstimate:
-        """What is sent of a window."""
+        """What is sent of a window; one that could not be identified is a dropped one."""
+        if estimate is not None and not estimate.identified:
+            window, estimate = replace(window, outcome="dropped", reason=estimate.reason), None
         return cls(
             window.start,
             window.outcome,

@@ -9,6 +9,7 @@ time.
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 import time
 from collections import deque
@@ -26,6 +27,7 @@ from sprung.service.monitoring.compute import Compute, Priority
 from sprung.service.monitoring.engines import ServedModel
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.together import FoundWindow, track_together
+from sprung.service.monitoring.turns import Turns
 from sprung.service.store.vehicle_models import SERVICE_FILE
 from sprung.service.store.windows import WindowRecord
 
@@ -100,14 +102,14 @@ class Batcher:
         beside: Batcher | None = None,
     ) -> None:
         """limit: windows that may wait; observe: told the seconds of each stage, both queues among them; beside: takes
-        the windows of vehicles with a model of their own, for which others do not wait."""
+        the windows of vehicles with a model of their own, for which others do not wait; such vehicles take turns."""
         self._pipeline = pipeline
         self._compute = compute
         self._limit = limit
         self._observe = observe
         self._beside = beside
         self._reading = 0
-        self._waiting: deque[_Request] = deque()
+        self._waiting = Turns(_whose)
         self._to_track: deque[_Request] = deque()
         self._lock = threading.Lock()
         self._called = False  # a batch is in the compute's queue, or being identified
@@ -159,9 +161,9 @@ class Batcher:
             beside.take(request)
 
     def take(self, request: _Request) -> None:
-        """A window that another batcher has read."""
+        """A window that another batcher has read; of one vehicle no more wait than there are places left for others."""
         with self._lock:
-            if len(self._waiting) >= self._limit:
+            if self._waiting.alike(request) >= self._limit - len(self._waiting):
                 request.answer, refused = _busy(), [request]
             else:
                 self._waiting.append(request)
@@ -176,7 +178,7 @@ class Batcher:
         """Whether a batch is better off with windows that are being read just now; the last of them calls."""
         if not self._reading or len(self._waiting) >= ENOUGH:
             return False
-        return not self._waiting or time.perf_counter() - self._waiting[0].since < PATIENCE
+        return time.perf_counter() - min((one.since for one in self._waiting), default=math.inf) < PATIENCE
 
     def _tracker_is_behind(self) -> bool:
         """Whether a batch would wait behind another one for the tracker; that calls when it takes the other one."""
@@ -189,8 +191,7 @@ class Batcher:
         try:
             self._compute.submit(self._identify, Priority.REQUEST)
         except Busy:
-            refused = list(self._waiting)
-            self._waiting.clear()
+            refused = self._waiting.clear()
             for request in refused:
                 request.answer = _busy()
             return refused
@@ -200,7 +201,7 @@ class Batcher:
     def _identify(self) -> None:
         """One batch; runs in the numerics' thread."""
         with self._lock:
-            batch = [self._waiting.popleft() for _ in range(min(TOGETHER, len(self._waiting)))]
+            batch = self._waiting.take(lambda one: self._pipeline.pace.windows(one.sent.served, TOGETHER))
         now = time.perf_counter()
         alike: dict[tuple[int, bool, bool], list[_Request]] = {}
         for request in batch:
@@ -231,6 +232,7 @@ class Batcher:
                 self._estimate([request])
             return
         self._observe(seconds)
+        self._pipeline.pace.note(first.served, len(batch), sum(seconds.values()))
         for request, estimate in zip(batch, estimates, strict=True):
             request.answer = AnsweredWindow(request.sent, estimate)
 
@@ -277,6 +279,11 @@ class Batcher:
             return
         for request, record in zip(batch, records, strict=True):
             request.answer = AnsweredWindow(request.sent, request.estimate, record)
+
+
+def _whose(request: _Request) -> str | None:
+    """Whose turn it has: that of its vehicle where this has a model of its own."""
+    return None if request.sent.served.version == SERVICE_FILE else request.sent.vehicle
 
 
 def _is_followed(request: _Request) -> bool:

@@ -26,6 +26,7 @@ from sprung.service.settings import Settings
 # one window of so many is weighed for gains and delays, which costs as much as a refinement: enough to tell a gain of
 # 2 % in a minute
 WEIGHED_OF = 2
+OWN_SECONDS = 10.0  # of processor time for a window of a vehicle with a model of its own
 _SCATTERED = 2654435761  # 2^32 over the golden ratio (Knuth): neighbours fall far apart
 
 log = logging.getLogger("sprung.engine")
@@ -133,7 +134,8 @@ def engine_like(engine: Engine, system: System) -> Engine:
     """
     from sprung.model.identification.identify import load_identifier  # brings torch
 
-    identifier = load_identifier(system)  # one worker: the other processors are for vehicles without such a file
+    # one worker: the other processors are for vehicles without such a file
+    identifier = load_identifier(system, seconds=OWN_SECONDS)
     return replace(engine, system=system, identifier=identifier, tracker=make_tracker(system))
 
 

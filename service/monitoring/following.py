@@ -88,7 +88,9 @@ def _pass(
 ) -> FollowedWindows:
     tracker, system = engine.tracker, engine.system
     records, ran = [], []
-    for window, estimate in zip(windows, estimates, strict=True):
+    for window, found in zip(windows, estimates, strict=True):
+        outcome, reason = outcome_of(window, found)
+        estimate = found if found is not None and found.identified else None
         posterior, before = None, followed
         followed = followed.after(tracker, window, estimate, now, system.conditions(window.auxiliary))
         fed = estimate is not None and followed.last == window.start and followed is not before
@@ -98,7 +100,6 @@ def _pass(
         known = fed and tracker.loads_as_of(followed.state) is None
         loads = in_kg(engine, tracker.loads(followed.state)) if known else {}
         alone = {} if estimate is None else in_kg(engine, tracker.loads_of_window(estimate))
-        outcome, reason = outcome_of(window, estimate)
         stood = counted(outcome, model_id) if posterior is not None else {}
         ran.append(Ran(window.start, running(system, window, loads) | stood))
         solved = None if estimate is None else Solved.of(estimate)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from sqlalchemy import Connection
 
-from sprung.model.signals import Estimate, Window
+from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.monitoring.changes import OnAlarms, TrackerChange, keep_changes, keep_statuses, new_status
 from sprung.service.monitoring.compute import Compute, Priority
@@ -20,6 +20,7 @@ from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.engines import Engines, ServedModel
 from sprung.service.monitoring.following import FollowedWindows, Following, follow
 from sprung.service.monitoring.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, ToFold
+from sprung.service.monitoring.turns import Pace
 from sprung.service.monitoring.views import VehicleView, vehicle_view
 from sprung.service.store import Store, fleet, status
 from sprung.service.store.partitions import prepare
@@ -60,6 +61,7 @@ class Pipeline:
         self.store = store
         self._compute = compute
         self._beside = beside or compute
+        self.pace = Pace()
         self._listeners = listeners
         self._limit = vehicles_in_memory
         self._clock = clock
@@ -131,10 +133,25 @@ class Pipeline:
             return [None] * len(windows), {}
         values = np.stack(whole)  # shape (B, T, C)
         starts = [w.start for w in windows if w.outcome != "dropped"]
-        compute = self.compute_of(served)
-        estimates, seconds = compute.run(lambda: served.engine.identify(values, starts=starts), priority)
+        estimates: list[Estimate] = []
+        total: dict[str, float] = {}
+        while len(estimates) < len(values):
+            turn = slice(len(estimates), len(estimates) + self.pace.windows(served, len(values)))
+            some, seconds = self._identified(served, values[turn], starts[turn], priority)
+            estimates += some
+            total = {stage: total.get(stage, 0.0) + took for stage, took in seconds.items()}
         found = iter(estimates)
-        return [None if w.outcome == "dropped" else next(found) for w in windows], seconds
+        return [None if w.outcome == "dropped" else next(found) for w in windows], total
+
+    def _identified(
+        self, served: ServedModel, values: FloatArray, starts: list[int], priority: Priority
+    ) -> tuple[list[Estimate], dict[str, float]]:
+        """Windows (B, T, C) at once."""
+        estimates, seconds = self.compute_of(served).run(
+            lambda: served.engine.identify(values, starts=starts), priority
+        )
+        self.pace.note(served, len(values), sum(seconds.values()))
+        return estimates, seconds
 
     def _commit(
         self,

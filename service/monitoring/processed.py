@@ -48,9 +48,11 @@ NO_EXCITATION = "no excitation: standstill, or too slow to tell anything"
 
 def outcome_of(window: Window, estimate: Estimate | None) -> tuple[str, str | None]:
     """A window's outcome with the reason for it, once it is known what it tells."""
-    if estimate is not None and not estimate.informative:
+    if estimate is None:
+        return window.outcome, window.reason
+    if not estimate.informative:
         return "uninformative", NO_EXCITATION
-    return window.outcome, window.reason
+    return (window.outcome if estimate.identified else "dropped"), estimate.reason or window.reason
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from sprung.model.identification.estimates import WITHOUT_VALUES
 from sprung.service.monitoring.views import VehicleView, suspected, told, unclear
 from sprung.service.rendering.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
@@ -40,7 +41,10 @@ def hints(
         found.append(Hint("warning", "Stale", text))
     if every and row.windows["dropped"] > MOSTLY * every:
         why = next((r.reason for r in reasons if r.outcome == "dropped"), "see below")
-        text = f"Most often: {why}. Check the sensors and the bus that are named under Windows."
+        advice = "Check the sensors and the bus that are named under Windows"
+        if why.startswith(WITHOUT_VALUES):
+            advice = "Go back to another model under Model, or leave laws out of this one"
+        text = f"Most often: {why}. {advice}."
         found.append(Hint("warning", "Most windows are dropped", text))
     if every and row.windows["uninformative"] > MOSTLY * every:
         text = (

@@ -286,8 +286,9 @@ def outdated(connection: Connection, model_id: int) -> list[str]:
 
 
 def without_numbers(reason: str) -> str:
-    """A reason as a kind of reason: measured numbers in it are left out, names with digits stay."""
-    return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(?![\w.])", "N", reason)[:200]
+    """A reason as a kind of reason: measured numbers in it are left out; limits ("longer than 10 s") and names with
+    digits stay."""
+    return re.sub(r"(?<![\w.])(?<!than )[-+]?\d+(\.\d+)?(?![\w.])", "N", reason)[:200]
 
 
 def _filtered(query: Select[Any], wanted: Wanted) -> Select[Any]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from sprung.model.identification.deviations import deviations
 from sprung.model.identification.identify import Identifier, load_identifier
+from sprung.model.identification.law_search import LawSearch
 from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import Estimate
 from sprung.model.system import parse_system
@@ -61,6 +64,44 @@ def test_laws_that_no_window_can_hold_are_refused_by_name() -> None:
     vehicle = strut("{time_varying_damping: {p: 0.1, tau: 10}}")
     with pytest.raises(UnusableWindow, match="strut: windows cannot be identified with time_varying_damping"):
         load_identifier(vehicle)
+
+
+def test_a_window_that_takes_too_long_has_no_values_and_says_so(windows: np.ndarray) -> None:
+    identifier = load_identifier(strut(FRICTION), seconds=0.0)
+    for estimate in identifier.identify(windows[:2]):
+        assert not estimate.identified and estimate.informative and estimate.iterations == 0
+        assert estimate.reason == "not identified: took longer than 0 s of processor time"
+        assert not estimate.identifiable.any() and np.isfinite(estimate.covariance).all()
+    assert all(e.identified and e.reason is None for e in load_identifier(strut(FRICTION)).identify(windows[:2]))
+
+
+def test_looking_for_the_cause_of_a_misfit_ends_with_the_time_of_the_window(
+    windows: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong, iterated = windows[:2].copy(), [0]
+    wrong[:, :, 2] = np.random.default_rng(3).normal(0, 3, wrong.shape[:2])
+    identifier = load_identifier(strut(FRICTION), seconds=1.0)
+    assert isinstance(identifier, Identifier)
+    iterate = LawSearch._iterate
+
+    def counted(*given: Any, **named: Any) -> None:
+        iterated[0] += 1
+        if iterated[0] == 10:  # the window itself is done by then
+            identifier._work.until = 0.0
+        iterate(*given, **named)
+
+    monkeypatch.setattr(LawSearch, "_iterate", counted)
+    for estimate in identifier.examine(wrong, np.ones(2, dtype=bool)):
+        assert estimate.identified and not estimate.adequate
+        assert estimate.reason is not None and estimate.reason.endswith("takes longer than 1 s of processor time")
+    assert iterated[0] <= 10
+
+
+@pytest.mark.parametrize("law", ["{formula: {formula: '-a*v', a: 1.0e5}}", "{cubic_stiffness: {k3: -1.0e12}}"])
+def test_a_window_that_cannot_be_simulated_says_so(windows: np.ndarray, law: str) -> None:
+    for estimate in load_identifier(strut(law)).identify(windows[:2]):
+        assert not estimate.identified and not estimate.adequate and estimate.informative
+        assert estimate.reason is not None and estimate.reason.startswith("cannot be simulated: ")
 
 
 def test_a_window_at_standstill_tells_nothing() -> None:

@@ -13,7 +13,6 @@ from sprung.model.diagnosis.fit.optimise import Fit, optimise, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import Working
 from sprung.model.diagnosis.fit.whitening import Whitener
-from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.record.channels import DiagnosisError
 from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, seen_noise, transform
 from sprung.model.diagnosis.response.point import Point
@@ -21,6 +20,7 @@ from sprung.model.diagnosis.response.terms import given_terms
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
+from sprung.model.work import WorkBudget
 
 _STRETCHES, _FEWEST, _STEPS = (16, 8, 4, 2), 60, 8  # divisors of a free decay fitted first; least samples; iterations
 _REFITS, _SETTLED = 12, 0.05  # alternations of fit and force noise; relative change of the level at convergence

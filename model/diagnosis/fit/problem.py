@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.fit.memory import FitMemory
-from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.record.signals import Noise, Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
@@ -22,6 +21,7 @@ from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
+from sprung.model.work import WorkBudget
 
 _ROUND = 0.01  # cost of one law evaluation, relative to the linearisation of a vehicle
 

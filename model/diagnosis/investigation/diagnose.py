@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
-from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import (
@@ -40,6 +39,7 @@ from sprung.model.diagnosis.rules import Rules
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import out_of_range
 from sprung.model.system import System
+from sprung.model.work import WorkBudget
 
 
 def investigate(system: System, record: Recorded, options: Options, tell: Progress) -> Outcome:

@@ -9,7 +9,6 @@ from typing import Protocol
 from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict
 from sprung.model.diagnosis.record.channels import Prepared
@@ -21,6 +20,7 @@ from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.diagnosis.selection.holdout import FreeRun, HeldOut
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
+from sprung.model.work import WorkBudget
 
 Progress = Callable[[float, str], None]  # share done, what comes next
 

@@ -298,7 +298,7 @@
     const found = await answer.json();
     if (!answer.ok) { at("windowstatus").textContent = found.detail; return; }
     const sensor = found.sensors[at("sensor").value];
-    at("windowstatus").textContent = `window of ${found.start.slice(0, 19).replace("T", " ")}, ${found.adequate ? "fits" : "does not fit"}`;
+    at("windowstatus").textContent = `window of ${found.start.slice(0, 19).replace("T", " ")}, ${found.adequate ? "fits" : found.reason || "does not fit"}`;
     pair.forEach((plot) => plot.destroy());
     at("compared").replaceChildren();
     const time = sensor.simulated.map((_, i) => i / found.sample_rate);

@@ -10,9 +10,9 @@ import pytest
 
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.fit.optimise import try_optimise
-from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.selection import compete
+from sprung.model.work import WorkBudget
 from tests.diagnosis_cases import problem_of, quarter_car, simulate
 
 

@@ -14,6 +14,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import firwin
 from sqlalchemy import select
 
+from sprung.model.identification.identify import Identifier
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Stage
@@ -214,7 +215,7 @@ def test_a_model_whose_windows_take_too_long_is_refused(
     client: TestClient, core: Core, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     core.pipeline.process("a", [])
-    monkeypatch.setattr("sprung.service.monitoring.engines.MOST_SECONDS", 1e-4)
+    monkeypatch.setattr("sprung.service.monitoring.engines.OWN_SECONDS", 1e-4)
     answer = client.post("/vehicles/a/model", json={"system": FOUND})
     assert answer.status_code == 422 and "of processor time" in answer.json()["detail"]
     hung = [f"hung{i}: {{mass: 1}}" for i in range(61)]
@@ -223,6 +224,26 @@ def test_a_model_whose_windows_take_too_long_is_refused(
     large = large.replace("sensors:", "  " + "\n  ".join(held) + "\nsensors:")
     answer = client.post("/vehicles/a/model", json={"system": large})
     assert answer.status_code == 422 and "bodies" in answer.json()["detail"], answer.text
+
+
+def test_windows_without_values_are_dropped_with_the_reason(
+    client: TestClient, core: Core, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core.pipeline.process("a", [])
+    assert client.post("/vehicles/a/model", json={"system": FOUND}).status_code == 200
+    with core.store.read() as connection:
+        identifier = core.pipeline.engines.of(connection, "a").engine.identifier
+    assert isinstance(identifier, Identifier) and identifier.seconds == 10.0
+    identifier.seconds = 0.0
+    moved = np.random.default_rng(4).normal(0, 1, (200, 5)).T.tolist()
+    channels = dict(zip(["road.displacement", "road.velocity", "wheel_a", "car_a", "strut_f"], moved, strict=True))
+    answer = client.post("/identify?track=true", json={"vehicle": "a", "sample_rate": 200, "channels": channels}).json()
+    reason = "not identified: took longer than 0 s of processor time"
+    assert answer["fit"]["reason"] == reason and not answer["fit"]["adequate"]
+    assert client.get("/vehicles/a").json()["windows"]["dropped"] == 1
+    assert reason in client.get("/pages/vehicles/a").text
+    metrics = client.get("/metrics").text
+    assert 'reason="not identified: took longer than 0 s of processor time",vehicle="a"} 1.0' in metrics
 
 
 def test_a_version_of_another_service_file_gives_way_to_it(settings: Settings, ride: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,72 @@ def test_windows_of_a_vehicle_with_a_model_of_its_own_hold_up_nobody(running: Co
 
     quick, waited, slow = asyncio.run(both())
     assert waited and quick.record is not None and slow.asked.vehicle == "slow"
+
+
+def test_vehicles_with_models_of_their_own_take_turns_of_about_the_same_time(
+    running: Core, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared = running.pipeline.engines.shared
+    seconds = {"slow": 10.0, "quick": 0.1}  # a window
+    order: list[str] = []
+    own = running.batcher._beside
+    assert own is not None
+
+    def estimated(batch: Sequence[Any]) -> None:
+        for request in batch:
+            order.append(request.sent.vehicle)
+            request.answer = Busy("identified")
+        served = batch[0].sent.served
+        running.pipeline.pace.note(served, len(batch), seconds[order[-1]] * len(batch))
+
+    monkeypatch.setattr(own, "_estimate", estimated)
+    models = {name: replace(shared, version=1, model_id=100 + i) for i, name in enumerate(seconds)}
+    windows = [
+        replace(asked(running, system, name, second), served=models[name], start=None)
+        for name, count in (("slow", 4), ("quick", 12))
+        for second in range(count)
+    ]
+    release = threading.Event()
+    running.beside.submit(release.wait)
+
+    async def all_of_them() -> None:
+        waiting = [asyncio.ensure_future(running.batcher.ask(ready(one))) for one in windows]
+        while own.waiting < len(windows):
+            await asyncio.sleep(0.005)
+        release.set()
+        await asyncio.gather(*waiting, return_exceptions=True)
+
+    asyncio.run(all_of_them())
+    first = order[0]
+    assert order.count("slow") == 4 and order.count("quick") == 12
+    # a window each until it is known how long they take, then eight quick ones beside one slow one
+    turns = [(who, len(list(group))) for who, group in groupby(order)]
+    expected = [("slow", 1), ("quick", 1), ("slow", 1), ("quick", 8), ("slow", 1), ("quick", 3), ("slow", 1)]
+    assert turns == (expected if first == "slow" else turns) and max(n for who, n in turns if who == "slow") == 1
+
+
+def test_one_vehicle_with_a_model_of_its_own_leaves_places_for_others(running: Core, system: System) -> None:
+    own = running.batcher._beside
+    assert own is not None
+    own._limit = 8
+    mine = replace(running.pipeline.engines.shared, version=1)
+    slow = replace(asked(running, system, "slow", 0), served=mine, start=None)
+    other = replace(slow, vehicle="other")
+    release = threading.Event()
+    running.beside.submit(release.wait)
+
+    async def ask() -> tuple[list[AnsweredWindow | BaseException], AnsweredWindow]:
+        many = [asyncio.ensure_future(running.batcher.ask(ready(slow))) for _ in range(8)]
+        while own.waiting + sum(one.done() for one in many) < len(many):
+            await asyncio.sleep(0.005)
+        one = asyncio.ensure_future(running.batcher.ask(ready(other)))
+        while own.waiting < 5:
+            await asyncio.sleep(0.005)
+        release.set()
+        return await asyncio.gather(*many, return_exceptions=True), await one
+
+    answers, answer = asyncio.run(ask())
+    assert sum(isinstance(one, Busy) for one in answers) == 4 and answer.asked.vehicle == "other"
 
 
 def test_windows_gather_while_the_tracker_is_busy_and_those_for_no_tracker_do_not_wait(

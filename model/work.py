@@ -1,4 +1,4 @@
-"""Budget of work of one diagnosis: counted, not timed, so that results do not depend on the machine.
+"""Budget of work of one search: counted, not timed, so that results do not depend on the machine.
 
 A service may set a time limit as well; a search that reaches it reports its findings so far.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 
 class WorkBudget:
@@ -16,10 +16,13 @@ class WorkBudget:
     Every evaluation of a law over the record counts as a share of a linearisation.
     """
 
-    def __init__(self, most: float, until: float = math.inf) -> None:
-        """until: time limit by `time.monotonic`, s."""
+    def __init__(
+        self, most: float = math.inf, until: float = math.inf, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """until: time limit by the clock, s."""
         self.most = most
         self.until = until
+        self.clock = clock
         self.done = 0.0
 
     def add(self, samples: float) -> None:
@@ -29,7 +32,7 @@ class WorkBudget:
     @property
     def ended(self) -> bool:
         """Whether the budget or the time limit is exhausted."""
-        return self.done >= self.most or time.monotonic() >= self.until
+        return self.done >= self.most or self.clock() >= self.until
 
     @property
     def limit(self) -> str:
@@ -38,7 +41,7 @@ class WorkBudget:
 
     def apart(self, count: int) -> list[WorkBudget]:
         """Budgets for `count` threads, each with all that is left: independent of the other threads' progress."""
-        return [WorkBudget(self.most - self.done, self.until) for _ in range(count)]
+        return [WorkBudget(self.most - self.done, self.until, self.clock) for _ in range(count)]
 
     def gather(self, parts: Sequence[WorkBudget]) -> None:
         """Count the work of threads."""
