@@ -64,6 +64,7 @@ class Settings(BaseSettings):
     client_connections: int = Field(default=256, gt=0)  # of one address
     header_seconds: float = Field(default=10.0, gt=0)  # in which a request's header must come
     body_idle_seconds: float = Field(default=10.0, gt=0)  # without a byte of a body
+    client_broken_per_second: float = Field(default=50.0, gt=0)  # requests that one address breaks off; more: refused
     client_requests_per_second: float = Field(default=500.0, gt=0)  # of one address or token; more are 429
     tls_certificate: Path | None = None  # PEM; with it, HTTPS
     tls_key: Path | None = None  # PEM; where it is not in the certificate's file

@@ -7,8 +7,9 @@ that send half of one, or that ask for much and take nothing of it, would hold t
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import time
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Iterable
 from typing import Protocol
 
@@ -17,6 +18,8 @@ from sprung.service.settings import Settings
 LOOK_SECONDS = 1.0
 RESERVED_DESCRIPTORS = 128  # for the store, uploads and workers
 MOST_LINGERING = 64  # refused connections that are still told so; they count in none of the limits
+BURST_SECONDS = 2.0  # of the permitted rate of broken-off requests that may come at once
+MOST_CLIENTS = 10_000  # whose broken-off requests are remembered
 MOST_UNSENT_BYTES = 200_000_000  # of answers that clients have not taken, of all together
 
 
@@ -45,7 +48,8 @@ class Doorkeeper:
     """Connections of one server.
 
     When there are too many, the client that holds most of them gives one up for one that holds fewer: first what only
-    waits, and longest.  Who holds connections open loses them, and nobody else notices.
+    waits, and longest.  Who holds connections open loses them, and nobody else notices.  A client that begins many
+    requests and breaks them off is not let in for a while: each costs as much as one that is answered.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -53,6 +57,8 @@ class Doorkeeper:
         self.body_idle_seconds = settings.body_idle_seconds
         self._most = min(settings.connections, max(16, _descriptors() - RESERVED_DESCRIPTORS))
         self._most_each = settings.client_connections
+        self._broken = LeakyBuckets(settings.client_broken_per_second)
+        self._proxies = [ipaddress.ip_network(proxy) for proxy in settings.trusted_proxies]
         self._open: dict[Connection, None] = {}
         self._clients: Counter[str] = Counter()
         self.lingering = 0
@@ -64,6 +70,9 @@ class Doorkeeper:
 
     def admit(self, new: Connection) -> bool:
         """Whether there is room for a connection; closes another one for it where it can."""
+        if self._broken.full(new.host):
+            self.refused += 1
+            return False
         if self._clients[new.host] >= self._most_each or len(self._open) >= self._most:
             yielding = self._yielding(new.host)
             if yielding is None:
@@ -81,6 +90,14 @@ class Doorkeeper:
             self._clients[gone.host] -= 1
             if not self._clients[gone.host]:
                 del self._clients[gone.host]
+
+    def broke_off(self, gone: Connection) -> None:
+        """A client has gone, or was given up, before its request had come whole.
+
+        What comes through a proxy is not the proxy's fault, nor that of one whose connection was wanted for others.
+        """
+        if gone in self._open and not self._is_proxy(gone.host):
+            self._broken.add(gone.host)
 
     def lighten(self) -> None:
         """Close connections with the most that waits to be taken until all of it together is bearable."""
@@ -101,6 +118,12 @@ class Doorkeeper:
                 if connection.too_slow(now):
                     connection.end()
 
+    def _is_proxy(self, host: str) -> bool:
+        try:
+            return any(ipaddress.ip_network(host).subnet_of(proxy) for proxy in self._proxies)  # type: ignore[arg-type]
+        except (ValueError, TypeError):  # no address; of the other version
+            return False
+
     def _yielding(self, host: str) -> Connection | None:
         """The connection that is closed for a new one of a client; None where all are as worthy."""
         mine = self._clients[host]
@@ -119,6 +142,29 @@ class Doorkeeper:
         self.evicted += 1
         connection.end()
         self.leave(connection)
+
+
+class LeakyBuckets:
+    """Events by client, of which `rate` a second are forgotten; for one thread."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()  # events and when, by time.monotonic
+
+    def add(self, client: str) -> None:
+        """One more."""
+        self._levels[client] = (self._level(client) + 1.0, time.monotonic())
+        self._levels.move_to_end(client)
+        if len(self._levels) > MOST_CLIENTS:
+            self._levels.popitem(last=False)
+
+    def full(self, client: str) -> bool:
+        """Whether there were more lately than are permitted."""
+        return self._level(client) >= max(1.0, BURST_SECONDS * self._rate)
+
+    def _level(self, client: str) -> float:
+        level, at = self._levels.get(client, (0.0, 0.0))
+        return max(0.0, level - (time.monotonic() - at) * self._rate)
 
 
 def _longest_waiting(connections: Iterable[Connection]) -> Connection | None:

@@ -66,6 +66,8 @@ class GuardedProtocol(H11Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """A client has gone."""
+        if self._half_sent:
+            self.doorkeeper.broke_off(self)
         self.doorkeeper.leave(self)
         if self._lingers is not None:
             self._lingers.cancel()
@@ -135,6 +137,12 @@ class GuardedProtocol(H11Protocol):
     def _at_rest(self) -> bool:
         """Between two requests."""
         return self.conn.their_state is h11.IDLE and not self.conn.trailing_data[0]
+
+    @property
+    def _half_sent(self) -> bool:
+        """In the header or body of a request."""
+        state = self.conn.their_state
+        return state is h11.SEND_BODY or (state is h11.IDLE and bool(self.conn.trailing_data[0]))
 
     def too_slow(self, now: float) -> bool:
         """Whether a request that has begun does not arrive, or an answer is not taken."""

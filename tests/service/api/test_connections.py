@@ -16,6 +16,8 @@ from tests.served import served
 from tests.service.api.test_server import ask, settings
 
 HALF = b"GET /vehicles HTTP/1.1\r\nHost: loc"
+UPLOAD = b"POST /recordings HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+UPLOAD += b'Content-Length: 1000\r\n\r\n--b\r\nContent-Disposition: form-data; name="file"; filename="a.csv"\r\n\r\n1'
 ONE = b"GET /static/vendor/swagger-ui-bundle.js HTTP/1.1\r\nHost: localhost\r\n\r\n"  # 1.5 MB, without a token
 LARGE = 5 * ONE  # more than the kernel holds for a client
 
@@ -81,6 +83,22 @@ def test_who_is_refused_hears_why(engine: Engine, tmp_path: Path) -> None:
         answer = ask(port, headers="X-Long: " + 5000 * "x" + "\r\n")
         assert answer.startswith(b"HTTP/1.1 503")
         assert b"retry-after" in answer
+
+
+@pytest.mark.parametrize("begun", [HALF, UPLOAD])
+def test_requests_that_are_begun_and_broken_off_cost_their_client_the_next_connections(
+    engine: Engine, tmp_path: Path, begun: bytes
+) -> None:
+    core = build_core(settings(tmp_path, client_broken_per_second=0.5), engine)
+    with served(core) as port, ExitStack() as stack:
+        for _ in range(3):
+            client(stack, port, "127.0.0.2", begun).close()
+        deadline = time.monotonic() + 10
+        answer = b""
+        while b"503" not in answer:  # as soon as the server has seen that the client is gone
+            assert time.monotonic() < deadline
+            answer = client(stack, port, "127.0.0.2", b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n").recv(100)
+        assert b"200 OK" in ask(port)
 
 
 def test_what_is_given_up_does_not_stay_in_the_kernel(engine: Engine, tmp_path: Path) -> None:

@@ -97,3 +97,31 @@ def test_answers_that_nobody_takes_are_bounded_together(tmp_path: Path, monkeypa
 )
 def test_a_network_of_ipv6_is_one_client(address: str, client: str) -> None:
     assert client_of(address) == client
+
+
+def test_who_breaks_off_many_requests_is_not_let_in_for_a_while(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr("sprung.service.api.doorkeeper.time.monotonic", lambda: now[0])
+    settings = Settings(data_dir=tmp_path, client_broken_per_second=5, trusted_proxies=("10.0.0.0/8",))
+    door = Doorkeeper(settings)
+    for host in ("1.2.3.4", "10.0.0.7", "fe80::/64"):
+        for _ in range(10):
+            one = Held(host)
+            assert door.admit(one)
+            door.broke_off(one)
+            door.leave(one)
+    assert [door.admit(Held(host)) for host in ("1.2.3.4", "10.0.0.7", "fe80::/64", "5.6.7.8")] == [0, 1, 0, 1]
+    now[0] += 0.3
+    assert door.admit(Held("1.2.3.4"))
+
+
+def test_who_was_closed_for_others_has_broken_nothing_off(tmp_path: Path) -> None:
+    door = Doorkeeper(Settings(data_dir=tmp_path, client_connections=1, client_broken_per_second=0.5))
+    held = [Held("a", waiting=True) for _ in range(5)]
+    for one in held:
+        assert door.admit(one)  # the one before is given up for it
+    for one in held[:-1]:
+        door.broke_off(one)
+    assert door.admit(Held("a"))
