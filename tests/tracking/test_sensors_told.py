@@ -158,7 +158,7 @@ def learned(windows: int) -> tuple[Tracker, TrackerState, np.random.Generator]:
 )
 def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begins: int, to: float) -> None:
     tracker, state, rng = copy.deepcopy(learned(begins))
-    for k in range(begins, begins + 900):
+    for k in range(begins, begins + 600):
         drift = to * np.clip((k - begins) / 400, 0, 1)
         state = tracker.update(state, gained(rng, np.array([drift, 0, 0, 0, 0, 0])), EPOCH + k * SECOND)
         state = TrackerState.from_dict(state.to_dict()) if k % 100 == 0 else state
@@ -183,8 +183,8 @@ def test_gains_and_clocks_that_were_always_off_are_told_and_no_alarm() -> None:
 def test_an_alarm_of_a_drift_closes_when_the_sensor_is_mended() -> None:
     rng, tracker = np.random.default_rng(8), make(GAINS)
     state = tracker.initial_state()
-    for k in range(1500):
-        drift = 0.06 * np.clip((k - 100) / 400, 0, 1) * (k < 900)
+    for k in range(900):
+        drift = 0.06 * np.clip((k - 60) / 300, 0, 1) * (k < 500)
         state = tracker.update(state, gained(rng, np.array([0, 0, drift, 0, 0, 0])), EPOCH + k * SECOND)
     assert next(a.parameter for a in state.alarms if a.kind == "sensor") == "c2.gain"
     assert state.active == ()
@@ -234,7 +234,7 @@ def test_chance_names_no_sensor() -> None:
     rng, tracker = np.random.default_rng(10), make(GAINS)
     state = tracker.initial_state()
     named = 0
-    for k in range(1500):
+    for k in range(1000):
         state = tracker.update(state, gained(rng, np.zeros(6), information=0.02**-2), EPOCH + k * SECOND)
         named += bool(tracker.sensors(state)) and k > 30
     assert named == 0

@@ -75,7 +75,7 @@ def test_weather_that_is_measured_raises_nothing_and_its_slope_is_learned() -> N
     rng = np.random.default_rng(1)
     slope, follow = -0.0027, tracker()
     state = day(rng, follow.initial_state(), 4320, lambda k: warm(k, slope)[1],
-                lambda k: Conditions(temperature=warm(k)[0]), every=5)  # fmt: skip
+                lambda k: Conditions(temperature=warm(k)[0]), every=8)  # fmt: skip
     assert state.alarms == ()
     assert state.weather is not None and follow.weather is not None
     kinds = [k for k in range(4) if state.weather.kind_mean[k, 1] < -0.01]  # of dampers
@@ -172,7 +172,7 @@ def test_the_fleet_teaches_a_new_vehicle_its_slopes() -> None:
     slope, others = -0.003, []
     for _ in range(3):
         state = day(rng, tracker().initial_state(), 2880, lambda k: warm(k, slope)[1],
-                    lambda k: Conditions(temperature=warm(k)[0]), every=5)  # fmt: skip
+                    lambda k: Conditions(temperature=warm(k)[0]), every=12)  # fmt: skip
         others.append(state)
     prior = weather.pooled(tracker().weather, [s.weather for s in others if s.weather is not None])
     taught = tracker().initial_state_from(others).weather
