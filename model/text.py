@@ -27,3 +27,16 @@ def escaped(text: str) -> str:
     'tram\\\\u202e 7'
     """
     return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+def one_line(text: str, longest: int | None = None) -> str:
+    """`text` as a line for a terminal: names in a file may hold line breaks, control characters and no end.
+
+    longest: characters that are kept; None: all.
+
+    >>> one_line("no such\\n  topic\\x07", longest=7)
+    'no such ...'
+    """
+    given = text if longest is None else text[: 4 * longest]
+    line = " ".join("".join(sign if sign.isprintable() else " " for sign in given).split())
+    return line if longest is None or len(line) <= longest else f"{line[:longest]} ..."

@@ -6,22 +6,17 @@ from collections import Counter
 from dataclasses import dataclass, field
 
 from sprung.model.signals import Tally
+from sprung.model.text import one_line
 
 KEPT_PROBLEMS = 100  # lines; a file can be damaged in a million places
 LONGEST_LINE = 1000  # characters; names in a file can have any length
-
-
-def one_line(text: str) -> str:
-    """`text` as a line for a terminal: names in a file may hold line breaks, control characters and no end."""
-    line = " ".join("".join(sign if sign.isprintable() else " " for sign in text[: 4 * LONGEST_LINE]).split())
-    return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]} ..."
 
 
 class UnreadableRecording(ValueError):
     """The input cannot be read at all; the message is one line that says what, where and what to do."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(one_line(message))
+        super().__init__(one_line(message, LONGEST_LINE))
 
 
 @dataclass(slots=True)
@@ -64,7 +59,7 @@ class Account:
         """One line for the user; by default it also marks the recording as incomplete."""
         self.incomplete = self.incomplete or incomplete
         if len(self.problems) < KEPT_PROBLEMS:
-            self.problems.append(one_line(line))
+            self.problems.append(one_line(line, LONGEST_LINE))
             return
         self.more_problems += 1
         if self.more_problems == 1:

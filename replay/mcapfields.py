@@ -10,7 +10,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, Literal
@@ -22,6 +22,7 @@ from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2Factory
 
 from sprung.model.signals import FloatArray, IntArray
+from sprung.model.text import one_line
 from sprung.replay.account import Account
 from sprung.replay.jsonkeys import KeyTwice, load, may_name_twice
 from sprung.replay.mcapfile import Messages
@@ -68,10 +69,11 @@ class Topic:
         self._stamp: tuple[tuple[str, ...], tuple[str, str]] | None = None  # where the messages carry their time
         for factory in () if self.is_json else (Ros2Factory(), ProtobufFactory()):
             try:
-                with redirect_stdout(io.StringIO()):  # the parser of ROS 2 definitions prints what it cannot read
+                # the parser of ROS 2 definitions prints what it cannot read
+                with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                     self.decode = self.decode or factory.decoder_for(channel.message_encoding, schema)
             except Exception as error:  # the decoders' parsers raise what they happen to raise
-                account.problem(f"schema of topic {self.name} cannot be read: {_line(error)}")
+                account.problem(f"schema of topic {self.name} cannot be read: {_words(error)}")
         if self.decode is None:
             account.problem(f"topic {self.name}: encoding {channel.message_encoding!r} cannot be read here")
 
@@ -204,8 +206,8 @@ def _times(stamps: list[int]) -> IntArray:
     return np.minimum(np.array(stamps, dtype=np.uint64), np.uint64(np.iinfo(np.int64).max)).astype(np.int64)
 
 
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+def _words(error: Exception) -> str:
+    return one_line(str(error), 200) or type(error).__name__
 
 
 def _choose(source: TimeSource, stamps: IntArray | None, publish: IntArray, log: IntArray) -> IntArray:

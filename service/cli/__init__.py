@@ -10,6 +10,8 @@ from collections.abc import Sequence
 
 import typer
 
+from sprung.model.text import one_line
+
 USAGE = 2
 INTERRUPTED = 130
 
@@ -65,14 +67,9 @@ def describe(error: Exception) -> str:
     if callable(usage):
         context = getattr(error, "ctx", None)
         command = getattr(context, "command_path", None) or "sprung"
-        return f"{_one_line(usage()).rstrip('.')}; see {command} --help"
+        return f"{one_line(usage()).rstrip('.')}; see {command} --help"
     if isinstance(error, OSError) and error.strerror:
-        return _one_line(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
+        return one_line(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
     if isinstance(error, ValueError):  # what every folder raises for input that cannot be used
-        return _one_line(str(error))
-    return f"unexpected {type(error).__name__}: {_one_line(str(error))}; SPRUNG_DEBUG=1 shows where"
-
-
-def _one_line(text: str) -> str:
-    """As one: what is told may hold line breaks and characters that a terminal obeys."""
-    return " ".join("".join(sign if sign.isprintable() else " " for sign in text).split())
+        return one_line(str(error))
+    return f"unexpected {type(error).__name__}: {one_line(str(error))}; SPRUNG_DEBUG=1 shows where"

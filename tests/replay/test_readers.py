@@ -102,6 +102,23 @@ def test_the_time_of_mcap_messages_can_be_chosen_by_channel(tmp_path: Path) -> N
         read(path, time_source="clock")
 
 
+def test_a_ros2_definition_that_cannot_be_read_is_one_line_of_ours(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("test_msgs/msg/Body", "ros2msg", b"float64 left\nflo@t64 ri-ght what\n")
+        channel = writer.register_channel("/body/acceleration", "cdr", schema)
+        for time in TIMES.tolist():
+            writer.add_message(channel, time, bytes(20), time)
+        writer.finish()
+    with pytest.raises(UnreadableRecording, match="schema of topic /body/acceleration cannot be read: 'flo@t64' is"):
+        read(path)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_an_empty_header_stamp_gives_way_to_the_publish_time(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_ros2(path, stamped=False)
