@@ -6,14 +6,14 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from sprung.model.identifier import StageTimes
-from sprung.model.signals import Estimate, FloatArray, Window
+from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault, Window
 from sprung.model.system import System
 from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.processes.worker import Emit
@@ -60,6 +60,21 @@ class FakeIdentifier:
             iterations=2,
             states=np.zeros((len(window), 2 * len(self.system.mechanics.dofs))) if states else None,
         )
+
+
+@dataclass
+class FakeExaminer(FakeIdentifier):
+    """Finds two exchanged channels in every window that is to be tracked, and notes what it was told of before."""
+
+    faults: tuple[MeasurementFault, ...] = (MeasurementFault("car_1l|car_1r", "swapped", 0.0),)
+    told: list[tuple[MeasurementFault, ...]] = field(default_factory=list)
+
+    def examine(
+        self, windows: FloatArray, weigh: BoolArray, known: Sequence[tuple[MeasurementFault, ...]] = ()
+    ) -> list[Estimate]:
+        assert len(windows) == len(weigh) == len(known)
+        self.told += known
+        return [replace(estimate, faults=self.faults) for estimate in self.identify(windows)]
 
 
 def make_window(system: System, number: int, level: float = 0.0, outcome: str = "used") -> Window:

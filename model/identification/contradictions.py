@@ -29,6 +29,12 @@ class Rearrangement:
 
     columns: tuple[int, ...]
 
+    @classmethod
+    def of(cls, fault: MeasurementFault, names: list[str]) -> Rearrangement | None:
+        """That of a reversed channel or of two exchanged ones; None where several were named, one of which it is."""
+        columns = tuple(names.index(name) for name in fault.channel.split("|"))
+        return cls(columns) if len(columns) == (1 if fault.kind == "inverted" else 2) else None
+
     def undone(self, windows: FloatArray) -> FloatArray:
         """Windows (..., C) as they would be without it."""
         out, columns = windows.copy(), list(self.columns)

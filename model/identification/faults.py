@@ -12,7 +12,7 @@ as much about the springs as any other.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,11 +24,13 @@ from sprung.model.identification.deviations import clock_groups, named
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.linearise import as_rows
 from sprung.model.identification.refine import Refined, Refines
+from sprung.model.identification.stuck import STUCK, StuckChannels
 from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
 from sprung.model.system import System
 
 FIT_SIGMAS = 6.0  # chi-square further than this above its expectation: the window does not fit
 ROUNDS = 5  # corrections of one window at most
+ITERATIONS = 6  # of a refinement that is tried
 TRIED = 8  # windows of a batch; when none of them can be explained, the others are not tried
 _FAR = (0.03, 1e-3, 0.03)  # gain, delay (s), load: beyond, a window is refined there rather than extrapolated
 _EVIDENT = 12.5  # log-likelihood ratio of such a step: five standard deviations
@@ -38,9 +40,6 @@ _LATE = (-0.045, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.045)  # s: delays too 
 _LATE_TRIED = 3  # windows of a batch that they are tried on; others begin with what these have in common
 _TRIALS = 3  # of such delays, reversed signs or exchanges, by their squares at the nominal values
 _SLIGHT = 0.1  # of what a data sheet leaves open; less is not taken back
-_FLAT = 0.8  # share of equal neighbours beyond which a channel is frozen
-_CLIPPED = 0.03  # share of samples at the very ends of the range, in runs, beyond which a channel is saturated
-_SHAKEN = 10.0  # deviations of its noise that a sensor moves by when the vehicle runs; doors and people stay below
 
 
 @dataclass(slots=True)
@@ -83,6 +82,8 @@ class Explainer:
         alike = [(int(group), c.unit) for group, c in zip(self.groups, system.channels, strict=True)]
         numbers = np.array([alike.index(one) for one in alike], dtype=np.int64)
         self.contradictions = Contradictions(refiner(samples).calibration, numbers)
+        self.stuck = StuckChannels(system)
+        self._along = bool(system.loads or system.built)  # whether these are refined with the parameters
         self.directions = self._directions()
         self._std = np.array([d.std for d in deviations])
         self._measured = np.arange(len(deviations)) < 2 * self.channels
@@ -102,16 +103,43 @@ class Explainer:
                 rows.append(together)
         return np.array(rows)
 
-    def explain(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
-        """Explanations of the windows `bad` of a batch (B, T, C), by index; those without one are left out."""
-        agreeing = self._agreeing(windows, bad)
-        bad = np.array([b for b in bad if b not in agreeing], dtype=np.int64)
-        return agreeing | self._plainly(windows, bad)
+    def again(self, windows: FloatArray, known: Mapping[int, tuple[MeasurementFault, ...]]) -> dict[int, Explained]:
+        """Explanations of windows of a batch (B, T, C) by the faults that earlier windows of their vehicles had.
 
-    def _agreeing(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
-        """Explanations of those of the windows `bad` whose redundant channels contradict each other until an exchange,
-        or a reversed sign, is undone."""
-        ends = {int(b): self.contradictions.ended_by(windows[b]) for b in bad if not self._stuck(windows[b])}
+        known: these faults, by window.  A window that does not show them, or does not fit with them put right, is left
+        out: what is wrong with it must be looked for anew.
+        """
+        found: dict[int, Explained] = {}
+        for faults in set(known.values()):
+            rows = np.array([b for b, theirs in known.items() if theirs == faults], dtype=np.int64)
+            found |= self._again(windows, rows, faults)
+        return found
+
+    def _again(self, windows: FloatArray, rows: IntArray, faults: tuple[MeasurementFault, ...]) -> dict[int, Explained]:
+        """The same for the windows `rows`, of which all are known to have these faults."""
+        stuck = {f.channel for f in faults if f.kind in STUCK}
+        turned = tuple(f for f in faults if f.kind not in STUCK)
+        undone = [Rearrangement.of(f, self.names) for f in turned]
+        seen = {int(b): self.stuck.channels(windows[b]) for b in rows}
+        rows = rows[[{f.channel for f in seen[b]} == stuck for b in rows.tolist()]]
+        if None in undone or not len(rows):  # one of several, which these windows may tell
+            return {}
+        told = [(*turned, *seen[b]) for b in rows.tolist()]
+        columns = np.array([self.names.index(name) for name in stuck], dtype=np.int64)
+        if (columns < len(self.system.inputs)).any():
+            return dict(zip(rows.tolist(), self._or_as_they_are(windows[rows], told, {}), strict=True))
+        restored = windows[rows]
+        for rearrangement in undone:
+            restored = restored if rearrangement is None else rearrangement.undone(restored)
+        restored[..., columns] = np.nan
+        agree = np.flatnonzero(~self.contradictions.contradicted(restored))
+        explained = self._by_steps(restored[agree], [told[i] for i in agree])
+        return {int(rows[agree[i]]): e for i, e in explained.items()}
+
+    def contradictory(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
+        """Explanations, by index, of those of the windows `bad` of a batch (B, T, C) whose redundant channels
+        contradict each other until an exchange, or a reversed sign, is undone."""
+        ends = {int(b): self.contradictions.ended_by(windows[b]) for b in bad if not self.stuck.channels(windows[b])}
         left = [b for b, candidates in ends.items() if candidates]
         found: dict[int, Explained] = {}
         while left:
@@ -128,24 +156,25 @@ class Explainer:
 
         Where several fit equally well, one fault of all their channels, and the windows are refined without these.
         """
-        costs = np.array([self._cost(c.undone(windows[:TRIED])) for c in candidates])
+        costs = self._costs(windows[:TRIED], candidates)
         likely = [c for c, cost in zip(candidates, costs, strict=True) if cost < costs.min() + 2 * _EVIDENT]
         faults = [c.fault(self.names) for c in likely]
         if len(likely) > 1:
             channels = dict.fromkeys(channel for fault in faults for channel in fault.channel.split("|"))
             together = MeasurementFault("|".join(channels), faults[0].kind, faults[0].value)
-            return [self._without(window, (together,)) for window in windows]
+            return self._without(windows, [(together,)] * len(windows))
         restored, known = likely[0].undone(windows), [tuple(faults)] * len(windows)
-        explained = self._by_steps(restored, known)
-        return [explained.get(i) or self._as_it_is(restored[i], known[i]) for i in range(len(windows))]
+        return self._or_as_they_are(restored, known, self._by_steps(restored, known))
 
-    def _cost(self, windows: FloatArray) -> float:
-        """Chi-square of refined windows (B, T, C), together."""
-        loads = np.full(len(windows), bool(self.system.loads or self.system.built))
-        refined = self._refined(windows, np.zeros((len(windows), len(self.deviations))), loads)
-        return float(sum(one.chi_square[0] * one.freedom[0] for one in refined))
+    def _costs(self, windows: FloatArray, candidates: Sequence[Rearrangement]) -> FloatArray:
+        """Chi-square of refined windows (B, T, C), together, with each of the candidates undone."""
+        restored = np.concatenate([candidate.undone(windows) for candidate in candidates])
+        start, along = None if self.start is None else self.start(restored), self._along
+        refined = self.refiner(self.samples).refine(restored, start, loads=along, built=along, iterations=ITERATIONS)
+        return np.asarray((refined.chi_square * refined.freedom).reshape(len(candidates), -1).sum(axis=1))
 
-    def _plainly(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
+    def explain(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
+        """Explanations of the windows `bad` of a batch (B, T, C), by index; those without one are left out."""
         found = self._explain(windows[bad[:TRIED]], bad[:TRIED])
         common = self._common(found)
         if common is not None:  # what most of them have is tried first with the others
@@ -189,17 +218,19 @@ class Explainer:
         return np.where(np.abs(point) > _SLIGHT * self._std, point, 0.0)
 
     def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, Explained]:
-        stuck = [self._stuck(window) for window in windows]
+        stuck = [self.stuck.channels(window) for window in windows]
         plain = np.array([i for i, faults in enumerate(stuck) if not faults], dtype=np.int64)
         found = {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
         left = np.array([i for i in plain if i not in found], dtype=np.int64)
         if len(left) and len(self._clocks) > 1:
             again = self._by_steps(windows[left], [()] * len(left), clocks=True)
             found |= {int(left[i]): e for i, e in again.items()}
+        still = [i for i, faults in enumerate(stuck) if faults]
+        found |= dict(zip(still, self._without(windows[still], [stuck[i] for i in still]), strict=True))
         late = 0
         for i, window in enumerate(windows):
             if i not in found:
-                strong = self._without(window, stuck[i]) if stuck[i] else self._turned(window)
+                strong = self._turned(window)
                 if strong is None and late < _LATE_TRIED:
                     strong, late = self._late(window), late + 1
                 if strong is not None:
@@ -221,7 +252,7 @@ class Explainer:
         if start is not None:
             point[:, : 2 * self.channels] = start[: 2 * self.channels]
         before = np.full(len(windows), np.inf)
-        loads = np.full(len(windows), bool(self.system.loads or self.system.built))
+        loads = np.full(len(windows), self._along)
         for _ in range(ROUNDS + 1):
             parts = self._refined(windows[active], point[active], loads[active])
             going = []
@@ -256,7 +287,12 @@ class Explainer:
                 start = None if self.start is None else self.start(restored)
                 inner = restored[:, edge : self.samples - edge]
                 refined = self.refiner(inner.shape[1]).refine(
-                    inner, start, loads=with_loads, built=with_loads, weigh=np.ones(len(rows), dtype=bool), iterations=6
+                    inner,
+                    start,
+                    loads=with_loads,
+                    built=with_loads,
+                    weigh=np.ones(len(rows), dtype=bool),
+                    iterations=ITERATIONS,
                 )
                 for k, row in enumerate(rows):
                     out[row] = refined.take(np.array([k]))
@@ -314,21 +350,28 @@ class Explainer:
     def _named(self, point: FloatArray) -> tuple[MeasurementFault, ...]:
         return named(self.deviations, point, np.zeros(len(point)), np.abs(point) > 0)
 
-    def _without(self, window: FloatArray, stuck: tuple[MeasurementFault, ...]) -> Explained:
-        """One window (T, C) without its frozen or saturated sensors; a stuck input is named, though not corrected."""
-        columns = np.array([self.names.index(name) for fault in stuck for name in fault.channel.split("|")])
-        sensors = columns[columns >= len(self.system.inputs)]
-        if len(sensors) == len(columns):
-            without = window.copy()
-            without[:, sensors] = np.nan
-            explained = self._by_steps(without[None], [stuck])
-            if 0 in explained:
-                return explained[0]
-        return self._as_it_is(window, stuck)
+    def _without(self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]]) -> list[Explained]:
+        """Windows (B, T, C) without the sensors that the faults of each name; a stuck input is named, though not
+        corrected."""
+        without, sensible = windows.copy(), []
+        for b, its in enumerate(faults):
+            columns = [self.names.index(name) for fault in its for name in fault.channel.split("|")]
+            if min(columns) >= len(self.system.inputs):
+                without[b][:, columns] = np.nan
+                sensible.append(b)
+        explained = self._by_steps(without[sensible], [faults[b] for b in sensible])
+        return self._or_as_they_are(windows, faults, {sensible[i]: e for i, e in explained.items()})
 
-    def _as_it_is(self, window: FloatArray, faults: tuple[MeasurementFault, ...]) -> Explained:
-        point = np.zeros((1, len(self.deviations)))
-        return Explained(self._refined(window[None], point, np.zeros(1, dtype=bool))[0], point[0], faults, False)
+    def _or_as_they_are(
+        self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]], explained: dict[int, Explained]
+    ) -> list[Explained]:
+        """Explanations of windows (B, T, C), by index; for those without one, what is wrong though it is not
+        corrected."""
+        left = [b for b in range(len(windows)) if b not in explained]
+        point = np.zeros((len(left), len(self.deviations)))
+        refined = self._refined(windows[left], point, np.zeros(len(left), dtype=bool))
+        as_they_are = {b: Explained(one, at, faults[b], False) for b, one, at in zip(left, refined, point, strict=True)}
+        return [explained.get(b) or as_they_are[b] for b in range(len(windows))]
 
     def _turned(self, window: FloatArray) -> Explained | None:
         """One window (T, C) with a reversed or two exchanged channels put right."""
@@ -354,39 +397,6 @@ class Explainer:
                 if 0 in explained:
                     return explained[0]
         return None
-
-    def _stuck(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
-        """Channels whose samples themselves show that they are frozen or saturated."""
-        found = []
-        for c, channel in enumerate(self.system.channels):
-            samples = window[:, c]
-            if not np.isfinite(samples).all():
-                continue
-            if np.mean(np.diff(samples) == 0) > _FLAT:
-                found.append(MeasurementFault(channel.name, "frozen", float(samples[-1])))
-                continue
-            for end in (samples.max(), samples.min()):
-                there = samples == end
-                if there.mean() > _CLIPPED and np.any(there[2:] & there[1:-1] & there[:-2]):
-                    found.append(MeasurementFault(channel.name, "saturated", float(end)))
-                    break
-        return tuple(found)
-
-    def still(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
-        """Whether all inputs of one window (T, C) are frozen although most sensors show that the vehicle runs: one
-        fault of them all, since what froze them is what they share.
-
-        At a standstill inputs may be as flat, where steps of the converter are coarse, but then sensors are quiet.
-        """
-        inputs = len(self.system.inputs)
-        if inputs == 0 or not np.all(np.mean(np.diff(window[:, :inputs], axis=0) == 0, axis=0) > _FLAT):
-            return ()
-        noise = np.array([channel.noise for channel in self.system.channels[inputs:]])
-        moves = window[:, inputs:].std(axis=0) > _SHAKEN * noise  # one that is absent is NaN and does not
-        if np.count_nonzero(moves) <= len(moves) / 2:
-            return ()
-        names = "|".join(channel.name for channel in self.system.channels[:inputs])
-        return (MeasurementFault(names, "frozen", float(window[-1, 0])),)
 
     def _reversed(self, window: FloatArray) -> list[tuple[FloatArray, MeasurementFault]]:
         """Windows with one sign turned or two channels exchanged that fit better at nominal values, the best first."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,16 +13,16 @@ import numpy as np
 from sprung.model.ambient.foreseen import foreseen
 from sprung.model.ambient.identify import AmbientIdentifier, OutputOnlyIdentifier
 from sprung.model.identification.deviations import deviations
-from sprung.model.identification.estimates import estimates
+from sprung.model.identification.estimates import EXCITED, estimates
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.faults import Explainer
+from sprung.model.identification.faults import Explained, Explainer
 from sprung.model.identification.linearise import PRIOR_STD, prior_std
 from sprung.model.identification.model_uncertainty import ModelUncertainty, model_uncertainty
 from sprung.model.identification.refine import Refined, Refiner, Refines
 from sprung.model.identification.with_laws import LawRefiner, acting_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
-from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
+from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray, IntArray, MeasurementFault
 from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
 from sprung.model.work import WorkBudget
@@ -64,54 +65,89 @@ class Identifier:
         *,
         states: bool = False,
         weigh: BoolArray | None = None,
-        explain: bool = False,
     ) -> list[Estimate]:
         """One `Estimate` per window.
 
         windows: (B, T, C) in the order of `system.channels`, NaN columns for absent sensors.
         start: log-ratios (B, P) to refine from, such as the tracker's; the estimator's where left out.
         weigh: windows (B,) whose evidence on gains, delays and loads is wanted, see `Estimate.deviating`.
-        explain: look for a wrong measurement or a load in windows that do not fit, see `model.identification.faults`.
         Errors: `UnusableWindow` for a wrong shape or an input that is not finite.
         """
         windows = self.system.undistorted(self._checked(windows))
         if len(windows) == 0:
             return []
-        self._work.until = time.thread_time() + self.seconds * len(windows)
+        self._allow(windows)
+        loads = any(load.declared for load in self.system.loads)
         begin = time.perf_counter()
-        loads = bool(self.system.loads) if explain else any(load.declared for load in self.system.loads)
-        if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
-            start = self.estimator.start(windows, self.workers, loads=loads)
+        start = self._start(windows, start, loads=loads)
         between = time.perf_counter()
-        refiner, built = self._refiner(windows.shape[1]), explain and bool(self.system.built)
-        refined = refiner.refine(windows, start, states=states, loads=loads, built=built, weigh=weigh)
-        found = self._estimates(refined, states)
-        if not explain:
-            found = [self._with_model_uncertainty(estimate) for estimate in found]
-            self.times = StageTimes(between - begin, time.perf_counter() - between)
-            return found
-        explainer = self._explainer(windows.shape[1])
-        found = [
-            e if e.informative else replace(e, faults=explainer.still(window))
-            for e, window in zip(found, windows, strict=True)
-        ]
-        contradicted = explainer.contradictions.contradicted(windows)
-        asks = [
-            (e.informative and self._asks(e, explainer)) or (contradicted[b] and (e.informative or e.running))
-            for b, e in enumerate(found)
-        ]
-        bad = np.flatnonzero(asks)
-        if len(bad):
-            for b, cause in explainer.explain(windows, bad).items():
-                (restored,) = self._estimates(cause.refined, False, cause.point)
-                told, known = restored.adequate and cause.corrected, restored.identified or bool(cause.faults)
-                found[b] = replace(self._averaged(restored), faults=cause.faults, adequate=told, identified=known)
-            if self._work.ended:
-                for b in bad.tolist():
-                    if found[b].identified and not found[b].adequate:
-                        found[b] = replace(found[b], reason=NOT_EXPLAINED + self._limit)
+        refined = self._refiner(windows.shape[1]).refine(windows, start, states=states, loads=loads, weigh=weigh)
+        found = [self._with_model_uncertainty(estimate) for estimate in self._estimates(refined, states)]
         self.times = StageTimes(between - begin, time.perf_counter() - between)
         return found
+
+    def examine(
+        self,
+        windows: FloatArray,
+        weigh: BoolArray,
+        known: Sequence[tuple[MeasurementFault, ...]] = (),
+        start: FloatArray | None = None,
+    ) -> list[Estimate]:
+        """As a tracker wants it: loads are refined along, the windows `weigh` (B,) say what they know of gains and
+        delays, and a wrong measurement is looked for where windows do not fit (`model.identification.faults`).
+
+        known: frozen, reversed and exchanged channels that earlier windows of the vehicle had, for each window: where
+        a window has them again, nothing else is tried.  windows, start: see `identify`.
+        """
+        windows = self.system.undistorted(self._checked(windows))
+        if len(windows) == 0:
+            return []
+        begin = time.perf_counter()
+        self._allow(windows)
+        explainer, everything = self._explainer(windows.shape[1]), np.arange(len(windows))
+        moved = self._refiner(windows.shape[1]).model.excitation(windows) > EXCITED
+        explained = explainer.again(windows, {b: its for b, its in enumerate(known) if its and moved[b]})
+        contradicted = moved & explainer.contradictions.contradicted(windows)
+        explained |= explainer.contradictory(windows, _left(np.flatnonzero(contradicted), explained))
+        plain = _left(everything, explained)
+        found, estimating = self._plainly(windows[plain], weigh[plain], None if start is None else start[plain])
+        asks = contradicted[plain] | np.array([e.informative and self._asks(e, explainer) for e in found], dtype=bool)
+        explained |= explainer.explain(windows, plain[asks])
+        whole = dict(zip(plain.tolist(), found, strict=True)) | {b: self._restored(e) for b, e in explained.items()}
+        for b in _left(everything, explained).tolist():
+            if not whole[b].informative:
+                whole[b] = replace(whole[b], faults=explainer.stuck.all_inputs(windows[b]))
+        for b in [*explained, *plain[asks].tolist()] if self._work.ended else ():
+            if whole[b].identified and not whole[b].adequate:
+                whole[b] = replace(whole[b], reason=NOT_EXPLAINED + self._limit)
+        self.times = StageTimes(estimating, time.perf_counter() - begin - estimating)
+        return [whole[b] for b in everything.tolist()]
+
+    def _plainly(self, windows: FloatArray, weigh: BoolArray, start: FloatArray | None) -> tuple[list[Estimate], float]:
+        """Windows (B, T, C) as a tracker wants them, taken for right; and the seconds that their start took."""
+        if len(windows) == 0:
+            return [], 0.0
+        loads, built, begin = bool(self.system.loads), bool(self.system.built), time.perf_counter()
+        start = self._start(windows, start, loads=loads)
+        estimating = time.perf_counter() - begin
+        refined = self._refiner(windows.shape[1]).refine(windows, start, loads=loads, built=built, weigh=weigh)
+        return self._estimates(refined, False), estimating
+
+    def _restored(self, cause: Explained) -> Estimate:
+        """The estimate of a window whose measurements were put right."""
+        (restored,) = self._estimates(cause.refined, False, cause.point)
+        told, known = restored.adequate and cause.corrected, restored.identified or bool(cause.faults)
+        return replace(self._averaged(restored), faults=cause.faults, adequate=told, identified=known)
+
+    def _allow(self, windows: FloatArray) -> None:
+        """Begin to count the work for some windows."""
+        self._work.until = time.thread_time() + self.seconds * len(windows)
+
+    def _start(self, windows: FloatArray, start: FloatArray | None, *, loads: bool) -> FloatArray | None:
+        """Log-ratios (B, P) to refine from: those given, or the estimator's where there is one."""
+        if start is not None or self.estimator is None or windows.shape[1] != self.estimator.samples:
+            return start
+        return self.estimator.start(windows, self.workers, loads=loads)
 
     def _estimates(self, refined: Refined, states: bool, point: FloatArray | None = None) -> list[Estimate]:
         """point: deviations (H,) that were taken back from the samples before."""
@@ -137,11 +173,6 @@ class Identifier:
         return replace(
             estimate, covariance=estimate.covariance + np.where(told, self._model_uncertainty.parameters, 0.0)
         )
-
-    def examine(self, windows: FloatArray, weigh: BoolArray) -> list[Estimate]:
-        """As a tracker wants it: loads are refined along, the windows `weigh` (B,) say what they know of gains and
-        delays, and a wrong measurement is looked for where windows do not fit."""
-        return self.identify(windows, weigh=weigh, explain=True)
 
     def _asks(self, estimate: Estimate, explainer: Explainer) -> bool:
         """Whether a window should be explained: it does not fit, or fits better elsewhere by far."""
@@ -256,6 +287,11 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
     std = np.sqrt(np.diagonal(refined.covariance, axis1=1, axis2=2))
     found: FloatArray = np.minimum(np.median(std, axis=0), PRIOR_STD)
     return found
+
+
+def _left(of: IntArray, explained: Collection[int]) -> IntArray:
+    """Those of some windows that are not explained."""
+    return np.array([b for b in of.tolist() if b not in explained], dtype=np.int64)
 
 
 def _deviating(

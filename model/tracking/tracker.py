@@ -276,17 +276,22 @@ class Tracker:
                 f"an estimate of {estimate.log_ratio.shape} parameters came; the tracker has {len(self.names)}"
             )
 
+    def hard_faults(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
+        """Frozen, saturated, reversed and exchanged channels."""
+        reported = (s for s in state.stuck if s.count >= HARD_FAULT_WINDOWS)
+        return tuple(MeasurementFault(s.channel, s.kind, s.value) for s in reported)
+
     def sensors(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
         """Sensor faults: stuck channels, and gains and delays that differ from the system file."""
-        stuck = [MeasurementFault(s.channel, s.kind, s.value) for s in state.stuck if s.count >= HARD_FAULT_WINDOWS]
+        stuck = self.hard_faults(state)
         H = self.model.size
         if H == 0 or state.calibration.recent[-1] == 0:
-            return tuple(stuck)
+            return stuck
         value = state.belief.mean[-H:]
         off = value - self.model.common_value(value)
         far = np.abs(off) > self.model.report_limit
         if not far.any():
-            return tuple(stuck)
+            return stuck
         std = self.model.relative_std(state.belief.covariance[-H:, -H:] + self._model_uncertainty[1])
         linear = np.where(self.model.gains, dev.linearisation_std(off), 0.0)
         std = np.sqrt(std**2 + dev.pending_variance(state.calibration, self.model) + linear**2)

@@ -105,7 +105,9 @@ class Onboard:
         whole = [w for w in windows if w.outcome != "dropped"]
         found: list[Estimate] = []
         if whole:
-            found, _ = self.engine.identify(np.stack([w.values for w in whole]), starts=[w.start for w in whole])
+            values, starts = np.stack([w.values for w in whole]), [w.start for w in whole]
+            known = [self.engine.tracker.hard_faults(self.state)] * len(whole)
+            found, _ = self.engine.identify(values, starts=starts, known=known)
         estimates = iter(found)
         for window in windows:
             estimate = None if window.outcome == "dropped" else _spoken(next(estimates))

@@ -222,8 +222,10 @@ class Batcher:
         first = batch[0].sent
         starts = None if first.states or first.start is None else [request.sent.start or 0 for request in batch]
         values = np.stack([request.sent.values for request in batch])
+        vehicles = [request.sent.vehicle for request in batch]
+        known = [() if name is None else self._pipeline.known_faults(name, first.served) for name in vehicles]
         try:
-            estimates, seconds = first.served.engine.identify(values, states=first.states, starts=starts)
+            estimates, seconds = first.served.engine.identify(values, states=first.states, starts=starts, known=known)
         except BaseException as error:
             if len(batch) == 1:
                 batch[0].answer = error

@@ -14,7 +14,7 @@ import numpy as np
 
 from sprung.model.identification.deviations import deviations
 from sprung.model.identifier import Identifies
-from sprung.model.signals import Estimate, FloatArray
+from sprung.model.signals import Estimate, FloatArray, MeasurementFault
 from sprung.model.system import MANCHESTER, System, load_system
 from sprung.model.tracking.alarms import LoadLimit
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
@@ -58,17 +58,22 @@ class Engine:
         }
 
     def identify(
-        self, values: FloatArray, states: bool = False, starts: Sequence[int] | None = None
+        self,
+        values: FloatArray,
+        states: bool = False,
+        starts: Sequence[int] | None = None,
+        known: Sequence[tuple[MeasurementFault, ...]] = (),
     ) -> tuple[list[Estimate], dict[str, float]]:
         """Estimates of windows, values of shape (B, T, C), and the seconds they took by stage.
 
         starts: ns, of windows that will be tracked: measurements that are wrong are looked for, too.
+        known: of each such window, `Tracker.hard_faults` of its vehicle, which spares looking for these anew.
         """
         examine = getattr(self.identifier, "examine", None)  # not every identifier can
         if starts is None or examine is None:
             estimates = self.identifier.identify(values, states=states)
         else:
-            estimates = examine(values, np.array([self._weighed(start) for start in starts]))
+            estimates = examine(values, np.array([self._weighed(start) for start in starts]), known)
         times = self.identifier.times
         return estimates, {"estimate": times.estimate, "refine": times.refine}
 

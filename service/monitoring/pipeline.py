@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from sqlalchemy import Connection
 
-from sprung.model.signals import Estimate, FloatArray, Window
+from sprung.model.signals import Estimate, FloatArray, MeasurementFault, Window
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.monitoring.changes import OnAlarms, TrackerChange, keep_changes, keep_statuses, new_status
 from sprung.service.monitoring.compute import Compute, Priority
@@ -100,7 +100,7 @@ class Pipeline:
             served = self.engines.of(connection, vehicle)
             known = known_windows(connection, vehicle, served.model_id, [w.start for w in windows])
         fresh = [w for w in windows if w.start not in known]
-        estimates, seconds = self._identify(served, fresh, priority)
+        estimates, seconds = self._identify(vehicle, served, fresh, priority)
         return Identified(vehicle, served, windows, known, fresh, estimates, seconds)
 
     def keep(self, found: Identified, recording_id: str | None = None) -> Batch:
@@ -124,8 +124,14 @@ class Pipeline:
         with self.store.read() as connection:
             return self._current(connection, [vehicle])[vehicle].state
 
+    def known_faults(self, vehicle: str, served: ServedModel) -> tuple[MeasurementFault, ...]:
+        """Of a vehicle's measurements, as far as its tracker is in memory; see `Engine.identify`."""
+        with self._lock:
+            held = self._vehicles.get(vehicle)
+        return () if held is None or held.served is not served else served.engine.tracker.hard_faults(held.state)
+
     def _identify(
-        self, served: ServedModel, windows: list[Window], priority: Priority
+        self, vehicle: str, served: ServedModel, windows: list[Window], priority: Priority
     ) -> tuple[list[Estimate | None], dict[str, float]]:
         """Estimates, None for dropped windows; and seconds by stage."""
         whole = [w.values for w in windows if w.outcome != "dropped"]
@@ -133,22 +139,29 @@ class Pipeline:
             return [None] * len(windows), {}
         values = np.stack(whole)  # shape (B, T, C)
         starts = [w.start for w in windows if w.outcome != "dropped"]
+        known = self.known_faults(vehicle, served)
         estimates: list[Estimate] = []
         total: dict[str, float] = {}
         while len(estimates) < len(values):
             turn = slice(len(estimates), len(estimates) + self.pace.windows(served, len(values)))
-            some, seconds = self._identified(served, values[turn], starts[turn], priority)
+            some, seconds = self._identified(served, values[turn], starts[turn], known, priority)
             estimates += some
             total = {stage: total.get(stage, 0.0) + took for stage, took in seconds.items()}
         found = iter(estimates)
         return [None if w.outcome == "dropped" else next(found) for w in windows], total
 
     def _identified(
-        self, served: ServedModel, values: FloatArray, starts: list[int], priority: Priority
+        self,
+        served: ServedModel,
+        values: FloatArray,
+        starts: list[int],
+        known: tuple[MeasurementFault, ...],
+        priority: Priority,
     ) -> tuple[list[Estimate], dict[str, float]]:
-        """Windows (B, T, C) at once."""
+        """Windows (B, T, C) of one vehicle at once; known: faults of its measurements."""
+        of_each = [known] * len(values)
         estimates, seconds = self.compute_of(served).run(
-            lambda: served.engine.identify(values, starts=starts), priority
+            lambda: served.engine.identify(values, starts=starts, known=of_each), priority
         )
         self.pace.note(served, len(values), sum(seconds.values()))
         return estimates, seconds

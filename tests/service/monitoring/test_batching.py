@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,15 @@ from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import System
 from sprung.service.api.problems import ApiProblem
-from sprung.service.core import Core
+from sprung.service.core import Core, build_core
 from sprung.service.errors import Busy
 from sprung.service.monitoring.batching import AnsweredWindow, AskedWindow
+from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.processed import Folded, ToFold
+from sprung.service.settings import Settings
 from sprung.service.store.windows import known_starts
 from sprung.service.times import NANOSECONDS
+from tests.service_fakes import FakeExaminer
 
 START = 1_790_000_000 * NANOSECONDS
 
@@ -63,6 +67,18 @@ def stored(core: Core, vehicle: str, seconds: range) -> set[int]:
         starts = [START + second * NANOSECONDS for second in seconds]
         found = known_starts(connection, vehicle, core.pipeline.model_id, starts)
     return {(start - START) // NANOSECONDS for start in found}
+
+
+def test_lasting_faults_of_a_vehicle_are_told_to_those_who_examine_its_windows(
+    engine: Engine, data_dir: Path, system: System
+) -> None:
+    examiner = FakeExaminer(system)
+    core = build_core(Settings(data_dir=data_dir), replace(engine, identifier=examiner))
+    for second in range(8):
+        at_once(core, [ready(asked(core, system, "a", second))])
+    at_once(core, [ready(asked(core, system, vehicle, 8)) for vehicle in "ab"])
+    core.close()
+    assert examiner.told[6:] == [examiner.faults] * 3 + [()]
 
 
 def test_windows_of_several_vehicles_are_tracked_in_one_transaction(

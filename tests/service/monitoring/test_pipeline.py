@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.schema import windows
-from tests.service_fakes import HOP, START, FakeIdentifier, hold, make_window
+from tests.service_fakes import HOP, START, FakeExaminer, FakeIdentifier, hold, make_window
 
 
 @pytest.fixture
@@ -81,6 +82,17 @@ def test_windows_older_than_the_trackers_are_stored_but_not_tracked(pipeline: Pi
     assert late.late == 1
     assert not late.records[0].tracked
     assert late.state.to_dict() == after.to_dict()
+
+
+def test_lasting_faults_of_a_vehicle_are_told_to_those_who_examine_its_windows(
+    engine: Engine, store: Store, compute: Compute, system: System
+) -> None:
+    examiner = FakeExaminer(system)
+    pipeline = Pipeline(replace(engine, identifier=examiner), store, compute)
+    pipeline.process("a", [make_window(system, i) for i in range(8)])
+    pipeline.process("b", [make_window(system, 0)])
+    pipeline.process("a", [make_window(system, 8)])
+    assert examiner.told == [()] * 9 + [examiner.faults]
 
 
 def test_dropped_windows_are_counted_and_tell_nothing(

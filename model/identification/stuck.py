@@ -1,0 +1,52 @@
+"""Channels whose samples themselves show that they are frozen or saturated."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.signals import FloatArray, MeasurementFault
+from sprung.model.system import System
+
+STUCK = ("frozen", "saturated")
+_FLAT = 0.8  # share of equal neighbours beyond which a channel is frozen
+_CLIPPED = 0.03  # share of samples at the very ends of the range, in runs, beyond which a channel is saturated
+_SHAKEN = 10.0  # deviations of its noise that a sensor moves by when the vehicle runs; doors and people stay below
+
+
+class StuckChannels:
+    """Of windows of one system."""
+
+    def __init__(self, system: System) -> None:
+        self.names = [channel.name for channel in system.channels]
+        self.inputs = len(system.inputs)
+        self.noise = np.array([channel.noise for channel in system.channels[self.inputs :]])
+
+    def channels(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
+        """Those of one window (T, C) that are frozen or saturated."""
+        found = []
+        for name, samples in zip(self.names, window.T, strict=True):
+            if not np.isfinite(samples).all():
+                continue
+            if np.mean(np.diff(samples) == 0) > _FLAT:
+                found.append(MeasurementFault(name, "frozen", float(samples[-1])))
+                continue
+            for end in (samples.max(), samples.min()):
+                there = samples == end
+                if there.mean() > _CLIPPED and np.any(there[2:] & there[1:-1] & there[:-2]):
+                    found.append(MeasurementFault(name, "saturated", float(end)))
+                    break
+        return tuple(found)
+
+    def all_inputs(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
+        """Whether all inputs of one window (T, C) are frozen although most sensors show that the vehicle runs: one
+        fault of them all, since what froze them is what they share.
+
+        At a standstill inputs may be as flat, where steps of the converter are coarse, but then sensors are quiet.
+        """
+        flat = np.mean(np.diff(window[:, : self.inputs], axis=0) == 0, axis=0) > _FLAT
+        if self.inputs == 0 or not flat.all():
+            return ()
+        moves = window[:, self.inputs :].std(axis=0) > _SHAKEN * self.noise  # one that is absent is NaN and does not
+        if np.count_nonzero(moves) <= len(moves) / 2:
+            return ()
+        return (MeasurementFault("|".join(self.names[: self.inputs]), "frozen", float(window[-1, 0])),)
