@@ -70,7 +70,7 @@ SENSOR_BIAS = SensorLaw(
     confused_with=("damper_asymmetry",),
     sentence="the sensor is off by {offset}",
     response=lambda p: SensorResponse(offset=p[0]),
-    at=("sensor", "force"),
+    at=("sensor", "support", "force"),
     of_instrument=lambda sheet: max(sheet.zero, sheet.gain * sheet.size),  # small signals: the zero, large: the gain
 )
 SENSOR_NOISE = SensorLaw(

@@ -56,7 +56,10 @@ def _size(signals: Signals, location: str) -> float:
     elif location in signals.force_names:
         series = signals.force[:, signals.force_names.index(location)]
     else:
-        return 0.0  # of measured motions only the gain is calibrated, which does not need it
+        support, _, quantity = location.rpartition(".")
+        if quantity not in ("displacement", "velocity"):
+            return 0.0  # of accelerations only the gain is calibrated, which does not need it
+        series = getattr(signals, quantity)[:, signals.support_names.index(support)]
     return float(np.std(series))
 
 
@@ -202,10 +205,10 @@ def faulty(state: Investigation) -> list[int]:
 
 
 def _is_observable(law: SensorLaw, *, rate: bool, support: bool) -> bool:
-    """Whether a fault is observable: rates have no offset, and supports are assumed to be sampled in time."""
+    """Whether a fault is observable beside others: rates have no offset; of supports only the gain is."""
     slope = law.slope()
     moved = slope.lag or slope.delay
-    return bool(slope.gain or (moved and not support) or (slope.offset and not rate))
+    return bool(slope.gain or (moved and not support) or (slope.offset and not rate and not support))
 
 
 def _of_all_channels(state: Investigation) -> tuple[Term, ...]:

@@ -84,12 +84,14 @@ def _of_key(candidates: Iterable[Candidate], term: Term) -> Candidate | None:
 
 def _redundant(noise: Noise, problem: Problem) -> float:
     """Chi-square of the differences between inputs that are measured twice."""
-    rho, band = problem.part.redundancy, problem.part.grid.band
+    part = problem.part
+    rho, band = part.redundancy, part.grid.band
     if not rho.size:
         return 0.0
+    offsets = float(np.sum(part.rate_offset**2 / noise.rate_offset_variance(part)))
     omega = problem.part.grid.omega[band][1:, None]
     level = noise.displacement**2 + (noise.velocity / omega) ** 2
-    return 2 * float(np.sum(np.abs(rho[band][1:]) ** 2 / level[:, problem.part.pairs]))
+    return 2 * float(np.sum(np.abs(rho[band][1:]) ** 2 / level[:, part.pairs])) + offsets
 
 
 def compensated(signals: Signals, term: Term) -> Signals:

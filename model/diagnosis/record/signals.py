@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from math import comb
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
 from sprung.model.diagnosis.rules import RULES, RecordRules
@@ -94,6 +95,12 @@ class Noise:
         w = omega[:, None]
         return 1 / (1 / self.displacement**2 + (w / self.velocity) ** 2 + (w**2 / self.acceleration) ** 2)
 
+    def rate_offset_variance(self, part: Part) -> FloatArray:
+        """Variance of `Part.rate_offset` of a part without offsets, (pairs,)."""
+        duration = part.grid.samples * part.grid.step
+        white = self.velocity**2 / part.grid.samples + 2 * (self.displacement / duration) ** 2
+        return np.asarray(white[part.pairs])
+
     def sensor_variance(self, grid: Grid, differentiated: np.ndarray) -> FloatArray:
         """Variance of the compared sensor signals per bin, (F, S); of positions compared by their rates, of the rate.
 
@@ -116,6 +123,7 @@ class Part:
     differentiated: np.ndarray  # sensors that measure a position and are compared by its rate, (S,)
     redundancy: ComplexArray  # V / j w - D_d of the supports with both, zero at zero frequency, (F, pairs)
     pairs: np.ndarray  # which supports, shape (pairs,)
+    rate_offset: FloatArray  # mean of the velocity channel less that by the displacement's two ends, m/s, (pairs,)
     displacement: ComplexArray  # of the displacement channel alone, without polynomial, (F, supports)
     velocity: ComplexArray  # of the velocity channel alone, as displacement V / j w, (F, supports)
 
@@ -270,6 +278,9 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
     fused = (D * precision_d + integrated * precision_v) / (precision_d + precision_v)
     pairs = np.flatnonzero(has_rate & ~signals.integrated)
     redundancy = (integrated - D)[:, pairs]
+    duration = (grid.samples - 1) * grid.step
+    mean_rate = trapezoid(v, dx=grid.step, axis=0) / duration
+    rate_offset = (mean_rate - (d[-1] - d[0]) / duration)[pairs]
     force_polynomial = np.zeros((grid.monomials.shape[1], signals.force.shape[1]))
     if signals.force.shape[1]:
         force_polynomial = detrend_ends(signals.force, None, grid)
@@ -283,6 +294,7 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
         differentiated=differentiated,
         redundancy=redundancy,
         pairs=pairs,
+        rate_offset=rate_offset,
         displacement=D,
         velocity=integrated,
     )

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from sprung.model.diagnosis.investigation.calibration import calibration_indices, faulty, within_tolerance
 from sprung.model.diagnosis.investigation.state import Outcome
-from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
-from sprung.model.diagnosis.report.values import law_parameters
+from sprung.model.diagnosis.report.report import IdentifiedLaw
+from sprung.model.diagnosis.report.values import input_fault_parameter, law_parameters
 from sprung.model.laws.bodies import MASS_CHANGE
 
 _SHOWN = 4  # in the summary
@@ -27,9 +27,9 @@ def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
         found.append((abs(parameter.value - term.law.absent[0]) / parameter.std, term, parameter))
     for fault in state.input_faults:
         if within_tolerance(state, fault.term):
-            spec, (value,) = fault.term.law.parameters[0], fault.term.parameters
-            parameter = LawParameter(spec.name, value, fault.std, spec.unit)
-            found.append((abs(value - fault.term.law.absent[0]) / max(fault.std, 1e-300), fault.term, parameter))
+            parameter = input_fault_parameter(state.system, fault)
+            away = abs(parameter.value - fault.term.law.absent[0]) / max(fault.std, 1e-300)
+            found.append((away, fault.term, parameter))
     told = [one for one in found if one[0] > 1]
     told.sort(key=lambda one: -one[0])
     return tuple(IdentifiedLaw(term.location, term.law.name, (parameter,)) for _, term, parameter in told)

@@ -12,12 +12,13 @@ from sprung.model.diagnosis.investigation.state import Found, InputFault, NoiseF
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of
-from sprung.model.diagnosis.report.values import formula_of, law_parameters
+from sprung.model.diagnosis.report.values import formula_of, input_fault_parameter, law_parameters
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ReportRules
 from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
+from sprung.model.system import System
 
 
 def findings_of(outcome: Outcome) -> list[Finding]:
@@ -27,7 +28,9 @@ def findings_of(outcome: Outcome) -> list[Finding]:
         return []
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in state.prepared.stuck]
     ranked += [(np.inf, _setup_finding(f)) for f in state.setup_faults]
-    ranked += [(f.score, _input_finding(f)) for f in state.input_faults if not within_tolerance(state, f.term)]
+    ranked += [
+        (f.score, _input_finding(state.system, f)) for f in state.input_faults if not within_tolerance(state, f.term)
+    ]
     ranked += [_out_of_order(outcome, index) for index in faulty(state)]
     ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
     if said.carried:
@@ -161,10 +164,9 @@ def _out_of_order(outcome: Outcome, index: int) -> tuple[float, Finding]:
     )
 
 
-def _input_finding(fault: InputFault) -> Finding:
-    spec = fault.term.law.parameters[0]
-    parameter = LawParameter(spec.name, fault.term.parameters[0], fault.std, spec.unit)
-    words = fault.term.law.sentence.format(**{spec.name: parameter.words()})
+def _input_finding(system: System, fault: InputFault) -> Finding:
+    parameter = input_fault_parameter(system, fault)
+    words = fault.term.law.sentence.format(**{parameter.name: parameter.words()})
     return Finding(
         location=fault.term.location,
         effect=fault.term.law.name,

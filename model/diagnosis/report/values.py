@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.investigation.state import InputFault
 from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, PlausibleRules
 from sprung.model.laws import ElementLaw, reversal_step
+from sprung.model.laws.base import ParameterSpec
 from sprung.model.laws.sensor_faults import OF_CHANNEL
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -54,6 +56,18 @@ def reported_parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ..
     return tuple(values)
 
 
+def _unit_at(system: System, location: str, spec: ParameterSpec) -> str:
+    """Unit of a law's parameter at a place: some are in that of the channel there."""
+    units = {channel.name: channel.unit for channel in system.channels}
+    return units.get(location, spec.unit) if spec.unit == OF_CHANNEL else spec.unit
+
+
+def input_fault_parameter(system: System, fault: InputFault) -> LawParameter:
+    """How large a fault of an input channel is."""
+    spec, location = fault.term.law.parameters[0], fault.term.location
+    return LawParameter(spec.name, fault.term.parameters[0], fault.std, _unit_at(system, location, spec))
+
+
 def law_parameters(fit: Fit, index: int, rules: PlausibleRules = RULES.plausible) -> tuple[LawParameter, ...]:
     term, place = fit.point.terms[index], fit.place(index)
     block = _with_corner(fit, term, fit.covariance[place, place])
@@ -65,14 +79,8 @@ def law_parameters(fit: Fit, index: int, rules: PlausibleRules = RULES.plausible
     told = _with_errors(block, errors) if isinstance(term.law, ElementLaw) else block + np.diag(errors**2)
     sigma = np.sqrt(np.maximum(np.diag(told), 0.0) + followed**2)
     hidden = not term.law.named
-    units = {channel.name: channel.unit for channel in fit.forward.system.channels}
     return tuple(
-        LawParameter(
-            spec.name,
-            float(value),
-            float(s),
-            units.get(term.location, spec.unit) if spec.unit == OF_CHANNEL else spec.unit,
-        )
+        LawParameter(spec.name, float(value), float(s), _unit_at(fit.forward.system, term.location, spec))
         for spec, value, s in zip(term.law.parameters, term.parameters, sigma, strict=True)
         if not hidden
     )

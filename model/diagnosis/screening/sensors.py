@@ -93,13 +93,32 @@ def _of_supports(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[
         level = np.hypot(noise.displacement[support], integrated)
         periodic = part.support[band, support]
         shown = _pack(part.redundancy[band, at] / level, grid.weight)
+        yield from _of_rate_offset(projector, laws, at)
         for channel, share, sign in (("displacement", share_d, -1.0), ("velocity", 1 - share_d, 1.0)):
             for law in laws:
+                if law.slope().offset:
+                    continue
                 signal = _factor(law.slope(), 1j * omega) * periodic
                 column = projector.pack(-G[:, :, support] * (share * signal)[:, None])
                 beside = _pack(sign * signal / level, grid.weight)
                 score, amplitude = projector.score(column, (float(beside @ shown), float(beside @ beside)))
                 yield _candidate(projector, law, f"{names[support]}.{channel}", score, amplitude, INPUT), 1
+
+
+def _of_rate_offset(projector: Projector, laws: list[SensorLaw], at: int) -> Iterator[tuple[Candidate, int]]:
+    """Offset of the velocity of a support whose displacement goes elsewhere in the long run.
+
+    No sensor sees it, since the mean motion is that of the displacement.  An offset of the displacement is another zero
+    of the support's position: nothing contradicts it.
+    """
+    part = projector.problem.part
+    variance = float(projector.problem.noise.rate_offset_variance(part)[at])
+    shown = float(part.rate_offset[at])
+    place = f"{supports(projector.problem.system)[part.pairs[at]]}.velocity"
+    for law in laws:
+        slope = law.slope().offset
+        if slope:
+            yield _candidate(projector, law, place, shown**2 / variance, shown / slope, INPUT), 1
 
 
 def _of_axles(projector: Projector, law: SensorLaw) -> Iterator[tuple[Candidate, int]]:
