@@ -57,9 +57,11 @@ def _size(signals: Signals, location: str) -> float:
         series = signals.force[:, signals.force_names.index(location)]
     else:
         support, _, quantity = location.rpartition(".")
-        if quantity not in ("displacement", "velocity"):
-            return 0.0  # of accelerations only the gain is calibrated, which does not need it
-        series = getattr(signals, quantity)[:, signals.support_names.index(support)]
+        if quantity != "velocity":
+            return 0.0  # only an offset needs it, and only velocities have one that shows
+        series = signals.velocity[:, signals.support_names.index(support)]
+        if not np.isfinite(series).all():
+            return 0.0
     return float(np.std(series))
 
 

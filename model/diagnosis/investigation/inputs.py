@@ -10,12 +10,15 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.state import InputFault, Nominal, Options
+from sprung.model.diagnosis.record.fused import QUANTITIES
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import Law, SensorLaw
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.drives import ORDERS
 from sprung.model.system import System
 
 
@@ -86,29 +89,43 @@ def _redundant(noise: Noise, problem: Problem) -> float:
     """Chi-square of the differences between inputs that are measured twice."""
     part = problem.part
     rho, band = part.redundancy, part.grid.band
+    fused = sum(one.chi_square for one in part.contradictions)
     if not rho.size:
-        return 0.0
+        return fused
     offsets = float(np.sum(part.rate_offset**2 / noise.rate_offset_variance(part)))
     omega = problem.part.grid.omega[band][1:, None]
     level = noise.displacement**2 + (noise.velocity / omega) ** 2
-    return 2 * float(np.sum(np.abs(rho[band][1:]) ** 2 / level[:, part.pairs])) + offsets
+    return 2 * float(np.sum(np.abs(rho[band][1:]) ** 2 / level[:, part.pairs])) + offsets + fused
 
 
 def compensated(signals: Signals, term: Term) -> Signals:
     """Signals with the fault of an input channel taken out."""
-    assert isinstance(term.law, SensorLaw)
     if term.location in signals.force_names:
         force = signals.force.copy()
         i = signals.force_names.index(term.location)
-        force[:, i] = term.law.restore(force[:, i], term.parameters, signals.sample_rate)
+        force[:, i] = _restored(force[:, i], term, signals)
         return replace(signals, force=force)
     if "." in term.location:
         name, channel = term.location.rsplit(".", 1)
         supports, channels = [name], [channel]
     else:  # an axle: all that is measured of its wheels
-        supports, channels = term.location.split("|"), ["displacement", "velocity"]
-    at = [signals.support_names.index(name) for name in supports]
-    result = {channel: getattr(signals, channel).copy() for channel in channels}
-    for series in result.values():
-        series[:, at] = term.law.restore(series[:, at].T, term.parameters, signals.sample_rate).T
-    return replace(signals, **result)
+        supports, channels = term.location.split("|"), list(QUANTITIES.values())
+    columns = {"displacement": signals.displacement.copy(), "velocity": signals.velocity.copy()}
+    fused = {one.support: one for one in signals.fused}
+    for i in map(signals.support_names.index, supports):
+        if i in fused:
+            faulty = fused[i].series.keys() & {ORDERS[channel] for channel in channels}
+            right = {order: _restored(fused[i].series[order], term, signals) for order in faulty}
+            fused[i] = replace(fused[i], series={**fused[i].series, **right})
+            columns["displacement"][:, i] = fused[i].displacement(1 / signals.sample_rate)
+            continue
+        for channel in columns.keys() & set(channels):
+            columns[channel][:, i] = _restored(columns[channel][:, i], term, signals)
+    return replace(
+        signals, displacement=columns["displacement"], velocity=columns["velocity"], fused=tuple(fused.values())
+    )
+
+
+def _restored(shown: FloatArray, term: Term, signals: Signals) -> FloatArray:
+    assert isinstance(term.law, SensorLaw)
+    return term.law.restore(shown, term.parameters, signals.sample_rate)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from sprung.model.diagnosis.record.fused import FusedMotion
 from sprung.model.diagnosis.record.highpass import carries_everything, passed
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.slower import slower, slower_by
@@ -16,7 +17,6 @@ from sprung.model.mechanics import ACCELERATION
 from sprung.model.schema import ForceInput, SupportInput, TrackInput
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import ORDERS
-from sprung.model.simulate.fusion import motion
 from sprung.model.system import System
 
 
@@ -201,12 +201,13 @@ class _Inputs:
     accelerated: list[bool]
     support_names: list[str]
     force_names: list[str]
+    fused: list[FusedMotion]
     levelled: FloatArray | None  # the acceleration of a support that nothing else tells of: then it is the only one
 
 
 def _inputs(system: System, values: FloatArray, dt: float, frozen: set[str], notes: list[str]) -> _Inputs:
     """Inputs from the columns (T, C) of a recording.  Errors: `DiagnosisError` when one is missing."""
-    found = _Inputs([], [], [], [], [], [], [], None)
+    found = _Inputs([], [], [], [], [], [], [], [], None)
     column = 0
     for name, source in system.file.inputs.items():
         if isinstance(source, TrackInput):  # nobody measures it
@@ -224,6 +225,8 @@ def _inputs(system: System, values: FloatArray, dt: float, frozen: set[str], not
             found = replace(found, levelled=there["acceleration"])
         elif "displacement" not in there and "displacement" in quantities:
             notes.append(f"{name}.displacement is missing: integrated from its {next(iter(there))}")
+        if "acceleration" in there and len(there) > 1:
+            found.fused.append(_fused(source, there, len(found.displacement)))
         d, v = _moved(source, there, dt)
         found.displacement.append(d)
         found.velocity.append(v)
@@ -272,6 +275,7 @@ def _by_role(
         accelerated=np.array(inputs.accelerated, dtype=bool),
         start=begin,
         speed=values[:, : len(system.inputs)] if system.on_track else empty,
+        fused=tuple(inputs.fused),
     )
     return Prepared(signals, stuck, tuple(notes))
 
@@ -286,10 +290,13 @@ def _moved(source: SupportInput, measured: dict[str, FloatArray], dt: float) -> 
     apart = np.full(len(next(iter(measured.values()))), np.nan)
     if "displacement" in measured and "acceleration" not in measured:
         return measured["displacement"], measured.get("velocity", apart)
-    by_order = {ORDERS[quantity]: series for quantity, series in measured.items()}
-    noise = {ORDERS[quantity]: source.measured[quantity].noise for quantity in measured}
-    d, _ = motion(by_order, dt, noise)
+    d = _fused(source, measured, 0).displacement(dt)
     return d, measured.get("velocity", apart) if set(measured) == {"velocity"} else apart
+
+
+def _fused(source: SupportInput, measured: dict[str, FloatArray], support: int) -> FusedMotion:
+    series = {ORDERS[quantity]: one for quantity, one in measured.items()}
+    return FusedMotion(support, series, {ORDERS[quantity]: source.measured[quantity].noise for quantity in measured})
 
 
 def _without_offsets(sensors: FloatArray, base: FloatArray, accelerations: np.ndarray) -> FloatArray:

@@ -58,5 +58,6 @@ def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signal
         velocity=high(signals.velocity),
         force=high(signals.force),
         sensors=high(signals.sensors),
+        fused=(),
     )
     return whole.part(cut, max(signals.samples - cut, cut)), edge

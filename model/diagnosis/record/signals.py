@@ -17,6 +17,7 @@ from math import comb
 import numpy as np
 from scipy.integrate import trapezoid
 
+from sprung.model.diagnosis.record.fused import Contradictions, FusedMotion, contradictions
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
@@ -56,6 +57,7 @@ class Signals:
     start: float = 0.0  # s, time of the first sample since the start of the recording
     speed: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # m/s, on a track, where measured, (T, 0 or 1)
     averaged: int = 1  # samples as they were recorded in every one of these
+    fused: tuple[FusedMotion, ...] = ()  # of the supports whose acceleration is measured beside something else
 
     @property
     def samples(self) -> int:
@@ -70,6 +72,7 @@ class Signals:
             force=self.force[start:stop],
             sensors=self.sensors[start:stop],
             speed=self.speed[start:stop],
+            fused=tuple(one.part(start, stop) for one in self.fused),
             start=self.start + start / self.sample_rate,
         )
 
@@ -126,6 +129,7 @@ class Part:
     rate_offset: FloatArray  # mean of the velocity channel less that by the displacement's two ends, m/s, (pairs,)
     displacement: ComplexArray  # of the displacement channel alone, without polynomial, (F, supports)
     velocity: ComplexArray  # of the velocity channel alone, as displacement V / j w, (F, supports)
+    contradictions: tuple[Contradictions, ...]  # of the supports whose acceleration is measured beside something else
 
 
 def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.record) -> Noise:
@@ -297,4 +301,7 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
         rate_offset=rate_offset,
         displacement=D,
         velocity=integrated,
+        contradictions=tuple(
+            one for fused in signals.fused if (one := contradictions(fused, grid.step, signals.averaged)) is not None
+        ),
     )

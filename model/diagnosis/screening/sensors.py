@@ -15,14 +15,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.terms import Term, supports
-from sprung.model.diagnosis.screening.families import FORCE, INPUT, SENSOR, Family
+from sprung.model.diagnosis.screening.families import FORCE, INPUT, SENSOR
 from sprung.model.diagnosis.screening.places import wheelsets
 from sprung.model.diagnosis.screening.score import Candidate, Projector
-from sprung.model.laws import Law, SensorLaw, SensorResponse
+from sprung.model.diagnosis.screening.supports import fault_candidate, fault_factor, support_candidates
+from sprung.model.laws import Law, SensorLaw
 from sprung.model.laws.base import Channels
-from sprung.model.signals import FloatArray
 
 
 def measurement_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
@@ -33,25 +32,11 @@ def measurement_candidates(projector: Projector, laws: tuple[Law, ...]) -> Itera
         return [law for law in faults if channel in law.at]
 
     yield from _of_sensors(projector, at("sensor"))
-    yield from _of_supports(projector, at("support"))
+    yield from support_candidates(projector, at("support"))
     for law in faults:
         if law.where == "axle":
             yield from _of_axles(projector, law)
     yield from _of_forces(projector, at("force"))
-
-
-def _candidate(
-    projector: Projector, law: SensorLaw, place: str, score: float, amplitude: float, family: Family, variant: str = ""
-) -> Candidate:
-    """A fault whose first parameter leaves its neutral value by an amplitude."""
-    scale = law.scale(projector.grid.step, amplitude)
-    values = (law.absent[0] + amplitude, *law.absent[1:])
-    return Candidate(Term(law, place, values, variant, scales=(scale,) * len(values)), score, family)
-
-
-def _factor(slope: SensorResponse, jw: ComplexArray) -> ComplexArray:
-    """Change of what is shown per truth, (F,)."""
-    return slope.gain - jw * (slope.lag + slope.delay)
 
 
 def _of_sensors(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Candidate, int]]:
@@ -66,7 +51,7 @@ def _of_sensors(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[C
         name = problem.system.sensors[index]
         for law in laws:
             slope = law.slope()
-            factor = _factor(slope, jw)
+            factor = fault_factor(slope, jw)
             if problem.part.differentiated[i] and not np.any(factor):
                 continue  # a position that is compared by its rate shows no bias
             signal = factor * truth[:, i] + slope.offset * constant
@@ -74,51 +59,7 @@ def _of_sensors(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[C
             determinant = projector.spread(column, own[i] * factor[:, None, None])
             score, amplitude = projector.score(column, (determinant, 0.0))
             for variant, form in [*law.forms.items(), ("", law)]:  # alike to first order
-                yield _candidate(projector, form, name, score, amplitude, SENSOR, variant), 1
-
-
-def _of_supports(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Candidate, int]]:
-    """Faults of the channels of supports that are measured twice."""
-    problem, grid = projector.problem, projector.grid
-    part, noise = problem.part, problem.noise
-    band = grid.band
-    omega = grid.omega[band]
-    G = projector.of_support
-    names = supports(problem.system)
-    for at, support in enumerate(part.pairs):
-        precision_d = 1 / noise.displacement[support] ** 2
-        precision_v = (omega / noise.velocity[support]) ** 2
-        share_d = precision_d / (precision_d + precision_v)
-        integrated = noise.velocity[support] / np.maximum(omega, omega[1])
-        level = np.hypot(noise.displacement[support], integrated)
-        periodic = part.support[band, support]
-        shown = _pack(part.redundancy[band, at] / level, grid.weight)
-        yield from _of_rate_offset(projector, laws, at)
-        for channel, share, sign in (("displacement", share_d, -1.0), ("velocity", 1 - share_d, 1.0)):
-            for law in laws:
-                if law.slope().offset:
-                    continue
-                signal = _factor(law.slope(), 1j * omega) * periodic
-                column = projector.pack(-G[:, :, support] * (share * signal)[:, None])
-                beside = _pack(sign * signal / level, grid.weight)
-                score, amplitude = projector.score(column, (float(beside @ shown), float(beside @ beside)))
-                yield _candidate(projector, law, f"{names[support]}.{channel}", score, amplitude, INPUT), 1
-
-
-def _of_rate_offset(projector: Projector, laws: list[SensorLaw], at: int) -> Iterator[tuple[Candidate, int]]:
-    """Offset of the velocity of a support whose displacement goes elsewhere in the long run.
-
-    No sensor sees it, since the mean motion is that of the displacement.  An offset of the displacement is another zero
-    of the support's position: nothing contradicts it.
-    """
-    part = projector.problem.part
-    variance = float(projector.problem.noise.rate_offset_variance(part)[at])
-    shown = float(part.rate_offset[at])
-    place = f"{supports(projector.problem.system)[part.pairs[at]]}.velocity"
-    for law in laws:
-        slope = law.slope().offset
-        if slope:
-            yield _candidate(projector, law, place, shown**2 / variance, shown / slope, INPUT), 1
+                yield fault_candidate(projector, form, name, score, amplitude, SENSOR, variant), 1
 
 
 def _of_axles(projector: Projector, law: SensorLaw) -> Iterator[tuple[Candidate, int]]:
@@ -126,12 +67,12 @@ def _of_axles(projector: Projector, law: SensorLaw) -> Iterator[tuple[Candidate,
     part, grid = projector.problem.part, projector.grid
     system = projector.problem.system
     names = supports(system)
-    factor = _factor(law.slope(), 1j * grid.omega[grid.band])
+    factor = fault_factor(law.slope(), 1j * grid.omega[grid.band])
     for location in wheelsets(system):
         at = [names.index(wheel) for wheel in location.split("|")]
         moved = -factor[:, None] * part.support[grid.band][:, at]
         column = projector.pack(np.einsum("fsa,fa->fs", projector.of_support[:, :, at], moved))
-        yield _candidate(projector, law, location, *projector.score(column), INPUT), 1
+        yield fault_candidate(projector, law, location, *projector.score(column), INPUT), 1
 
 
 def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Candidate, int]]:
@@ -155,9 +96,4 @@ def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Ca
             slope = law.slope()
             column = projector.pack(slope.gain * of_gain + slope.offset * of_offset)
             spread = projector.spread(column, fit.forward.inputs_by_force_fault(Term(law, name, law.absent))[band])
-            yield _candidate(projector, law, name, *projector.score(column, (spread, 0.0)), FORCE), 1
-
-
-def _pack(spectrum: ComplexArray, weight: FloatArray) -> FloatArray:
-    weighted = spectrum * weight
-    return np.concatenate([weighted.real, weighted.imag])
+            yield fault_candidate(projector, law, name, *projector.score(column, (spread, 0.0)), FORCE), 1
