@@ -22,7 +22,15 @@ from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import load_engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import Batch
-from sprung.service.monitoring.views import VehicleView, alarm_dict, load_parameters, told, vehicle_view, window_dict
+from sprung.service.monitoring.views import (
+    VehicleView,
+    alarm_dict,
+    load_parameters,
+    size_in_words,
+    told,
+    vehicle_view,
+    window_dict,
+)
 from sprung.service.processes.worker import ProcessLimits
 from sprung.service.settings import settings_with
 from sprung.service.sources.feed import Fed, comfort_dict, feed_file
@@ -211,11 +219,10 @@ def closing_line(view: VehicleView, fed: Fed) -> str:
     if fed.stored_before:
         lines.append(f"{fed.stored_before} windows were in the store already")
     for alarm in view.active:
-        change = "" if alarm.change is None else f" {100 * alarm.change:+.1f} %"
-        std = "" if alarm.std is None else f" ± {100 * alarm.std:.1f} %"
         what = told(alarm) or "windows no longer fit the model"
+        change = f" {size_in_words(alarm.parameter, alarm.change, alarm.std)}".rstrip()
         apart = "; the measurements do not tell which" if alarm.alternatives else ""
-        lines.append(f"{alarm.severity}: {what}{change}{std} since {to_iso(alarm.onset)}{apart}")
+        lines.append(f"{alarm.severity}: {what}{change} since {to_iso(alarm.onset)}{apart}")
     return "\n".join([*lines, *measurement_lines(view.measurements())])
 
 

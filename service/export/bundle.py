@@ -14,7 +14,7 @@ from sprung.service.export.tables import estimate, values_of
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.ring import Excerpt
 from sprung.service.monitoring.simulated import Compared
-from sprung.service.monitoring.views import told
+from sprung.service.monitoring.views import size_in_words, told
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.history import Series
 from sprung.service.store.marks import MarkRow
@@ -95,7 +95,7 @@ def _compared(file: McapSink, engine: Engine, window: Compared) -> None:
 def _alarm(file: McapSink, alarm: AlarmRow) -> None:
     level = ERROR if alarm.severity == "alarm" else WARNING
     what = told(alarm) or "windows no longer fit the model"
-    change = "" if alarm.change is None else f" {100 * alarm.change:+.1f} %"
+    change = f" {size_in_words(alarm.parameter, alarm.change)}".rstrip()
     file.event(alarm.onset, level, alarm.kind, f"{alarm.severity}: {what}{change}: begins here")
     file.event(alarm.opened, level, alarm.kind, f"{alarm.severity}: {what}{change}: raised")
     if alarm.closed is not None:

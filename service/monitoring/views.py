@@ -217,6 +217,18 @@ def told(alarm: Alarm | AlarmRow) -> str:
     return " or ".join([*alarm.alternatives, spoken(alarm.parameter or "")])
 
 
+def size_in_words(parameter: str | None, change: float | None, std: float | None = None) -> str:
+    """How large an alarm's change is, with its deviation where that is given; empty where it is not known.
+
+    Changes are relative, `-29.6 ± 1.5 %`; those of a delay are in s, `+4.0 ± 0.1 ms`.
+    """
+    if change is None:
+        return ""
+    factor, unit = (1e3, "ms") if (parameter or "").endswith(".delay") else (100.0, "%")
+    deviation = "" if std is None else f" ± {factor * std:.1f}"
+    return f"{factor * change:+.1f}{deviation} {unit}"
+
+
 def unclear(rivals: Sequence[str]) -> str:
     """A sentence on what the measurements do not tell an alarm from, to stand before others; empty where nothing."""
     heavier = all(rival.endswith(".mass") for rival in rivals)

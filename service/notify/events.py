@@ -6,7 +6,7 @@ import uuid
 from typing import Any
 from urllib.parse import quote
 
-from sprung.service.monitoring.views import finite, spoken, unclear
+from sprung.service.monitoring.views import finite, size_in_words, spoken, unclear
 from sprung.service.store.fleet import AlarmChange
 from sprung.service.times import optional_iso, to_iso
 
@@ -89,8 +89,8 @@ def sentence(event: dict[str, Any]) -> str:
         alarm = data["alarm"]
         kind = {"misfit": "windows no longer fit the model"}.get(alarm["kind"], alarm["kind"])
         what = " or ".join([*alarm.get("alternatives", ()), spoken(alarm["parameter"] or "") or kind])
-        size = "" if alarm["change"] is None else f" {100 * alarm['change']:+.1f} %"
-        return f"{data['vehicle']}: {alarm['severity']} {event['type'].rsplit('.', 1)[1]}: {what}{size}"
+        change = f" {size_in_words(alarm['parameter'], alarm['change'])}".rstrip()
+        return f"{data['vehicle']}: {alarm['severity']} {event['type'].rsplit('.', 1)[1]}: {what}{change}"
     if event["type"] == REPORT_READY:
         return f"{data['vehicle'] or 'recording'}: mismatch report: {data['verdict'].replace('_', ' ')}"
     return f"{data['vehicle']}: bus {data['source']} {'delivers again' if event['type'] == FEED_FOUND else 'is lost'}"

@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from sprung.service.monitoring.views import spoken
+from sprung.service.monitoring.views import size_in_words, spoken
 from sprung.service.times import to_iso
 
 signed_in: ContextVar[str] = ContextVar("signed_in", default="")  # whose session the request is of
@@ -33,7 +33,7 @@ def _environment() -> Environment:
     )
     environment.filters |= {"quantity": quantity, "percent": percent, "code": code, "moment": moment, "spoken": spoken}
     environment.filters["state"] = state
-    environment.globals |= {"asset": asset, "signed_in": signed_in.get}
+    environment.globals |= {"asset": asset, "signed_in": signed_in.get, "size_in_words": size_in_words}
     return environment
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sprung.model.identification.estimates import WITHOUT_VALUES
-from sprung.service.monitoring.views import VehicleView, suspected, told, unclear
+from sprung.service.monitoring.views import VehicleView, size_in_words, suspected, told, unclear
 from sprung.service.rendering.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason
@@ -77,7 +77,8 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
         worst = max(changed, key=lambda a: abs(a.change or 0.0))
         many = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
         level = "alarm" if any(a.severity == "alarm" for a in changed) else "warning"
-        size = f" by {_size(worst)}" if _size(worst) else ""
+        change = size_in_words(worst.parameter, worst.change, worst.std)
+        by = f" by {change}" if change else ""
         together = "*" in (worst.parameter or "")
         waiting = [a for a in changed if a.acknowledged is None]
         seen = f"Acknowledged by {worst.acknowledged_by or 'somebody'}."
@@ -88,7 +89,7 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
             else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew."
         )
         unsure = unclear(worst.alternatives)
-        found.append(Hint(level, f"{told(worst)} has changed{size}{many}", f"{_since(worst)}. {unsure}{what} {ask}"))
+        found.append(Hint(level, f"{told(worst)} has changed{by}{many}", f"{_since(worst)}. {unsure}{what} {ask}"))
     misfit = next((a for a in active if a.kind == "misfit"), None)
     if misfit is not None:
         cause = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."
@@ -102,14 +103,6 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
     return found
 
 
-def _size(alarm: AlarmRow) -> str:
-    """How large a change is, and how sure; empty where that is not known."""
-    if alarm.change is None:
-        return ""
-    std = "" if alarm.std is None else f" ± {100 * alarm.std:.1f}"
-    return f"{100 * alarm.change:+.1f}{std} %"
-
-
 def _since(alarm: AlarmRow) -> str:
     return f"Since {to_iso(alarm.onset)[:19].replace('T', ' ')} UTC"
 
@@ -117,8 +110,8 @@ def _since(alarm: AlarmRow) -> str:
 def _fault(alarm: AlarmRow) -> str:
     """What is wrong with the channels of an alarm of kind sensor, and since when."""
     channels, fault = suspected(alarm)
-    size = f" {_size(alarm)}" if fault == "gain" and _size(alarm) else ""
-    return f"{_since(alarm)}: {', '.join(channels)}, {fault}{size}"
+    change = size_in_words(alarm.parameter, alarm.change, alarm.std) if fault in ("gain", "delay") else ""
+    return f"{_since(alarm)}: {', '.join(channels)}, {fault} {change}".rstrip()
 
 
 def _sensors(sensors: Mapping[str, Mark], active: Sequence[AlarmRow]) -> list[Hint]:

@@ -89,7 +89,7 @@ def _redundant(noise: Noise, problem: Problem) -> float:
     """Chi-square of the differences between inputs that are measured twice."""
     part = problem.part
     rho, band = part.redundancy, part.grid.band
-    fused = sum(one.chi_square for one in part.contradictions)
+    fused = sum(one.chi_square for one in part.parity)
     if not rho.size:
         return fused
     offsets = float(np.sum(part.rate_offset**2 / noise.rate_offset_variance(part)))

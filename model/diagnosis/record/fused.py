@@ -37,8 +37,8 @@ class FusedMotion:
 
 
 @dataclass(frozen=True)
-class Contradictions:
-    """What the common motion leaves of the channels of one support over one part of a recording."""
+class ParityResiduals:
+    """What the common motion leaves of the channels of one support over one part of a recording: parity residuals."""
 
     support: int
     dt: float
@@ -88,7 +88,7 @@ class Contradictions:
         return np.asarray(column - self.constant * np.sum(self.constant * column))
 
 
-def contradictions(fused: FusedMotion, dt: float, averaged: int = 1) -> Contradictions | None:
+def parity_residuals(fused: FusedMotion, dt: float, averaged: int = 1) -> ParityResiduals | None:
     """None where a channel is taken for exact.  averaged: samples as they were recorded in every one of these."""
     if min(fused.noise.values()) <= 0:
         return None
@@ -100,7 +100,7 @@ def contradictions(fused: FusedMotion, dt: float, averaged: int = 1) -> Contradi
     left, constant = left_by_motion(np.stack([columns, zero]), dt, key)
     size = float(np.linalg.norm(constant))
     unit = constant / size if size > 0 else constant
-    found = Contradictions(fused.support, dt, noise, columns - left, left, unit)
+    found = ParityResiduals(fused.support, dt, noise, columns - left, left, unit)
     return replace(found, left=found._levelled(left))
 
 

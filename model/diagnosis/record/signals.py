@@ -17,7 +17,7 @@ from math import comb
 import numpy as np
 from scipy.integrate import trapezoid
 
-from sprung.model.diagnosis.record.fused import Contradictions, FusedMotion, contradictions
+from sprung.model.diagnosis.record.fused import FusedMotion, ParityResiduals, parity_residuals
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
@@ -129,7 +129,7 @@ class Part:
     rate_offset: FloatArray  # mean of the velocity channel less that by the displacement's two ends, m/s, (pairs,)
     displacement: ComplexArray  # of the displacement channel alone, without polynomial, (F, supports)
     velocity: ComplexArray  # of the velocity channel alone, as displacement V / j w, (F, supports)
-    contradictions: tuple[Contradictions, ...]  # of the supports whose acceleration is measured beside something else
+    parity: tuple[ParityResiduals, ...]  # of the supports whose acceleration is measured beside something else
 
 
 def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.record) -> Noise:
@@ -301,7 +301,7 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
         rate_offset=rate_offset,
         displacement=D,
         velocity=integrated,
-        contradictions=tuple(
-            one for fused in signals.fused if (one := contradictions(fused, grid.step, signals.averaged)) is not None
+        parity=tuple(
+            one for fused in signals.fused if (one := parity_residuals(fused, grid.step, signals.averaged)) is not None
         ),
     )

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sprung.model.diagnosis.record.fused import QUANTITIES, Contradictions
+from sprung.model.diagnosis.record.fused import QUANTITIES, ParityResiduals
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.terms import Term, supports
 from sprung.model.diagnosis.screening.families import INPUT, Family
@@ -22,7 +22,7 @@ from sprung.model.signals import FloatArray
 def support_candidates(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Candidate, int]]:
     """Every fault of a channel of a support that another channel contradicts."""
     yield from _of_pairs(projector, laws)
-    for one in projector.problem.part.contradictions:
+    for one in projector.problem.part.parity:
         yield from _of_fused(projector, laws, one)
 
 
@@ -84,7 +84,9 @@ def _of_rate_offset(projector: Projector, laws: list[SensorLaw], at: int) -> Ite
             yield fault_candidate(projector, law, place, shown**2 / variance, shown / slope, INPUT), 1
 
 
-def _of_fused(projector: Projector, laws: list[SensorLaw], measured: Contradictions) -> Iterator[tuple[Candidate, int]]:
+def _of_fused(
+    projector: Projector, laws: list[SensorLaw], measured: ParityResiduals
+) -> Iterator[tuple[Candidate, int]]:
     """Faults of the channels of a support whose acceleration is measured beside its displacement or velocity."""
     problem, grid = projector.problem, projector.grid
     support = measured.support

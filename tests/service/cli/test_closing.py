@@ -1,6 +1,14 @@
 """What a replay says last of measurements and loads."""
 
 from sprung.service.cli.replay import measurement_lines
+from sprung.service.monitoring.views import size_in_words
+
+
+def test_the_size_of_a_change_is_said_in_its_own_unit() -> None:
+    assert size_in_words("secondary_2r.damping", -0.2957, 0.0151) == "-29.6 ± 1.5 %"
+    assert size_in_words("bogie1_1l.delay", 0.00398, 0.00012) == "+4.0 ± 0.1 ms"
+    assert size_in_words("bogie1_1l.gain", 0.059) == "+5.9 %"
+    assert size_in_words(None, None) == ""
 
 
 def test_wrong_sensors_and_loads_are_told_below_the_table() -> None:
