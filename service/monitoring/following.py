@@ -87,6 +87,7 @@ def _pass(
     now: int,
 ) -> FollowedWindows:
     tracker, system = engine.tracker, engine.system
+    named = [load.body for load in system.loads if load.declared]
     records, ran = [], []
     for window, found in zip(windows, estimates, strict=True):
         outcome, reason = outcome_of(window, found)
@@ -104,7 +105,8 @@ def _pass(
         ran.append(Ran(window.start, running(system, window, loads) | stood))
         solved = None if estimate is None else Solved.of(estimate)
         record = WindowRecord(window.start, outcome, reason, window.repaired_samples, fed, solved, posterior)
-        records.append(replace(record, loads=WindowLoads(alone, loads)))
+        kept = WindowLoads(*({body: told[body] for body in named if body in told} for told in (alone, loads)))
+        records.append(replace(record, loads=kept))
     return FollowedWindows(followed, records, ran)
 
 

@@ -190,8 +190,8 @@ def _plain(row: Any) -> dict[str, Any]:
 def _schema() -> Any:
     import pyarrow as pa
 
-    kinds = {"String": pa.string(), "BigInteger": pa.int64(), "Integer": pa.int32(), "Float": pa.float64()}
-    kinds |= {"Boolean": pa.bool_(), "LargeBinary": pa.list_(pa.float64())}
+    kinds = {"String": pa.string(), "Text": pa.string(), "BigInteger": pa.int64(), "Integer": pa.int32()}
+    kinds |= {"Float": pa.float64(), "Boolean": pa.bool_(), "LargeBinary": pa.list_(pa.float64())}
     fields = [
         pa.field(column.name, kinds[type(column.type).__name__]) for column in windows.c if column.name != "model_id"
     ]

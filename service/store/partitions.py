@@ -117,6 +117,7 @@ _BINARY = {
     "Float": "float8",
     "Boolean": "bool",
     "String": "text",
+    "Text": "text",
     "LargeBinary": "bytea",
 }
 

@@ -131,6 +131,7 @@ windows = Table(  # PostgreSQL keeps a partition a month (`service.store.partiti
     Column("per_sensor", LargeBinary, nullable=True),  # nrmse, shape (S,)
     Column("posterior", LargeBinary, nullable=True),  # log-ratios that the tracker believed after it, shape (P,)
     Column("posterior_std", LargeBinary, nullable=True),  # shape (P,)
+    Column("loads", Text, nullable=True),  # JSON {"car": [by the window, believed]}, each [kg, std] or null
     Index("ix_windows_stored_ns", "stored_ns"),
     postgresql_partition_by="RANGE (start_ns)",
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -62,6 +63,20 @@ class WindowLoads:
     estimated: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by the window alone
     believed: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by the tracker after it
 
+    @classmethod
+    def read(cls, text: str | None) -> WindowLoads:
+        """The inverse of `text`."""
+        pairs = {} if text is None else json.loads(text)
+        estimated, believed = ({body: tuple(pair[i]) for body, pair in pairs.items() if pair[i]} for i in (0, 1))
+        return cls(estimated, believed)
+
+    def text(self) -> str | None:
+        """JSON, as the store keeps it; None where nothing is told."""
+        told = {
+            body: [self.estimated.get(body), self.believed.get(body)] for body in {**self.estimated, **self.believed}
+        }
+        return json.dumps(told, separators=(",", ":")) if told else None
+
 
 @dataclass(frozen=True, slots=True)
 class WindowRecord:
@@ -74,7 +89,7 @@ class WindowRecord:
     tracked: bool  # False: dropped, or older than what the tracker had seen
     solved: Solved | None  # None where dropped
     posterior: Posterior | None  # None where not tracked
-    loads: WindowLoads = WindowLoads()  # not kept by the store, but for means of minutes
+    loads: WindowLoads = WindowLoads()  # of bodies whose load the system file names
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +206,7 @@ def _window_row(record: WindowRecord) -> dict[str, Any]:
         "per_sensor": None if solved is None else pack(solved.per_sensor),
         "posterior": None if posterior is None else pack(posterior.log_ratio),
         "posterior_std": None if posterior is None else pack(posterior.std),
+        "loads": record.loads.text(),
     }
 
 
@@ -210,7 +226,10 @@ def _record(row: Row[Any]) -> WindowRecord:
             row.iterations,
         )
     posterior = None if row.posterior is None else Posterior(unpack(row.posterior), unpack(row.posterior_std))
-    return WindowRecord(row.start_ns, row.outcome, row.reason, row.repaired_samples, row.tracked, solved, posterior)
+    loads = WindowLoads.read(row.loads)
+    return WindowRecord(
+        row.start_ns, row.outcome, row.reason, row.repaired_samples, row.tracked, solved, posterior, loads
+    )
 
 
 def _parts(starts: Iterable[int]) -> Iterable[list[int]]:

@@ -20,7 +20,15 @@ from sprung.service.errors import UserError
 from sprung.service.fleet.local_postgres import PostgresServer
 from sprung.service.store import Store, fleet, history, open_store, partitions, retention, work
 from sprung.service.store.schema import metadata, windows
-from sprung.service.store.windows import Posterior, Solved, VehicleWindows, WindowRecord, add_windows, known_windows
+from sprung.service.store.windows import (
+    Posterior,
+    Solved,
+    VehicleWindows,
+    WindowLoads,
+    WindowRecord,
+    add_windows,
+    known_windows,
+)
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
 P, S = 3, 2
@@ -53,6 +61,16 @@ def test_migrations_make_the_tables_that_the_code_uses(any_store: Store) -> None
             connection, opts={"compare_type": True, "include_name": lambda name, *_: "windows_2" not in (name or "")}
         )
         assert compare_metadata(context, metadata) == []
+
+
+def test_the_load_of_a_window_is_read_back_as_it_was(any_store: Store) -> None:
+    whole = WindowLoads({"car": (3100.1, 400.3)}, {"car": (2950.7, 1 / 3)})
+    believed = WindowLoads({}, {"car": (2951.0, 60.0), "van": (-3.0, 1.0)})
+    loads = [whole, believed, WindowLoads()]
+    model = fill(any_store, [replace(record(i, 0.1), loads=of) for i, of in enumerate(loads)])
+    with any_store.read() as connection:
+        known = known_windows(connection, "a", model, [record(i).start for i in range(3)])
+    assert [known[record(i).start].loads for i in range(3)] == loads
 
 
 def test_sqlite_runs_in_wal_mode_with_foreign_keys(store: Store) -> None:
