@@ -150,7 +150,7 @@ class DeviationSensitivity:
         free = torch.linalg.solve_triangular(at.factor, at.free, upper=False)  # (B, N, K)
         J = at.sensitivities - at.across.mT @ at.free
         root = torch.linalg.cholesky(at.covariance)  # C = root root'
-        known = torch.cat([free, root.mT @ J], dim=1).to(torch.float32)  # (B, N + P, K)
+        known = torch.cat([free.to(torch.float32), (root.mT @ J).to(torch.float32)], dim=1)  # (B, N + P, K)
         r = after.residual.to(torch.float32)
         columns, redundant = self.columns(at, after, data, by_drive)
         rows = as_rows(columns)  # (B, H, K)

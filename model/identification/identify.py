@@ -318,15 +318,16 @@ def _deviating(
         at[loads] = refined.log_ratio[b, P:]
         inverse = np.linalg.inv(covariance[P:, P:])
         per_load = covariance[:P, P:] @ inverse  # (P, loads)
-        moved = cross[P:, : 2 * C]  # of the loads per gain or delay
-        information[: 2 * C, : 2 * C] += moved.T @ inverse @ moved
-        information[: 2 * C, loads] = -moved.T @ inverse
-        information[loads, : 2 * C] = information[: 2 * C, loads].T
+        if whole:
+            moved = cross[P:, : 2 * C]  # of the loads per gain or delay
+            information[: 2 * C, : 2 * C] += moved.T @ inverse @ moved
+            information[: 2 * C, loads] = -moved.T @ inverse
+            information[loads, : 2 * C] = information[: 2 * C, loads].T
+            cross = cross[:P] - np.pad(per_load @ moved, ((0, 0), (0, H - 2 * C)))
         information[loads, loads] = inverse - np.diag(prior)
         score[loads] = prior * refined.log_ratio[b, P:]
         given = given - per_load @ covariance[P:, :P]
-        cross = cross[:P] - np.pad(per_load @ moved, ((0, 0), (0, H - 2 * C)))
-        cross[:, loads] = per_load
+        cross[:P, loads] = per_load
     if (
         point is not None
     ):  # samples were divided by the gain: a relative deviation of what is left counts that much less

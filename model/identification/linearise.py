@@ -360,7 +360,8 @@ def normalised(free: Tensor) -> tuple[Tensor, Tensor]:
     norm = free.square().sum(dim=2).sqrt()
     seen = norm > _UNSEEN * norm.amax(dim=1, keepdim=True)
     scale = torch.where(seen, norm, torch.ones_like(norm))
-    return torch.where(seen.unsqueeze(2), free / scale.unsqueeze(2), 0.0), scale
+    unit = free / scale.unsqueeze(2)
+    return unit if bool(seen.all()) else torch.where(seen.unsqueeze(2), unit, 0.0), scale
 
 
 def as_rows(spectra: Tensor) -> Tensor:

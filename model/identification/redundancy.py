@@ -98,17 +98,13 @@ class Redundancy:
     ) -> tuple[Tensor, Tensor]:
         """Information (B, 2 Q, 2 Q) and score (B, 2 Q) on gains, then delays, of one support's Q channels z (B, T, Q),
         in units of their noise."""
-        B, T, Q = z.shape
-        left = left_by_motion(z, self.dt, key)  # (B, T, Q)
-        fitted = torch.as_tensor(z - left)
+        Q = z.shape[2]
+        fitted = torch.as_tensor(z - left_by_motion(z, self.dt, key))
         motions = torch.cat([fitted, -(slope @ fitted)], dim=2)  # (B, T, 2 Q)
-        alone = motions.new_zeros(B, 2 * Q, T, Q)
-        for x in range(2 * Q):
-            alone[:, x, :, x % Q] = motions[:, :, x]
-        shown = left_by_motion(alone.reshape(B * 2 * Q, T, Q).numpy(), self.dt, key)
-        rows = as_rows(spectra(torch.as_tensor(shown)).reshape(B, 2 * Q, -1, Q).permute(0, 2, 3, 1))  # (B, 2 Q, K)
-        r = as_rows(spectra(torch.as_tensor(left)).unsqueeze(3)).mT  # (B, K, 1)
+        shown = torch.as_tensor(self._map(key, spectra) * np.array([std for _, std in key])[:, None, None])  # (Q, T, K)
+        rows = torch.stack([motions[:, :, x] @ shown[x % Q] for x in range(2 * Q)], dim=1)  # (B, 2 Q, K)
+        r = torch.as_tensor(z).mT.flatten(1) @ shown.flatten(0, 1)  # (B, K)
         # Beyond its noise the fit leaves what is no gain and no delay: it counts as more noise.
         freedom = r.shape[1] * (Q - 1) / Q
-        excess = (r.square().sum(dim=(1, 2)) / freedom).clamp_min(1.0)[:, None]
-        return rows @ rows.mT / excess.unsqueeze(2), (rows @ r).squeeze(2) / excess
+        excess = (r.square().sum(dim=1) / freedom).clamp_min(1.0)[:, None]
+        return rows @ rows.mT / excess.unsqueeze(2), (rows @ r.unsqueeze(2)).squeeze(2) / excess

@@ -19,7 +19,7 @@ the old products give a second correction, at a tenth of the price.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -162,7 +162,10 @@ class Refiner:
 
         active = everything
         for _ in range(iterations):
-            share(iterate, self._pieces(present, active), self.workers)
+            # Those that are weighed side by side: pieces need not be taken apart for it.
+            share(
+                iterate, self._pieces(present, active[np.argsort(~wanted.numpy()[active], kind="stable")]), self.workers
+            )
             # The few that need more are gathered from all chunks.
             active = active[~progress.converged.numpy()[active]]
             if len(active) == 0:
@@ -325,8 +328,5 @@ def _limited(step: Tensor) -> Tensor:
 
 def in_order(parts: list[Refined], order: np.ndarray) -> Refined:
     """One batch of pieces whose windows are `order`, each in its place."""
-    back = np.argsort(order)
-    fields: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts])[back] for name in Refined.__slots__
-    }
-    return Refined(**fields)
+    whole = Refined(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in Refined.__slots__})
+    return whole if (np.diff(order) > 0).all() else whole.take(np.argsort(order))
