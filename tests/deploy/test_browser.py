@@ -10,6 +10,7 @@ import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1400, 380])
+@pytest.mark.parametrize("width", [1400, 800, 380])
 @pytest.mark.parametrize("name", PAGES)
 def test_pages_stay_at_home_fit_their_screen_and_say_no_error(
     address: str, browser: Any, name: str, width: int, scheme: str
@@ -259,6 +260,32 @@ def test_a_history_is_laid_beside_its_twins_and_zoomed_down_to_single_windows(ad
     page.close()
 
 
+# notes where times are written on canvases: from the top, from the left, to
+NOTED = """(() => { const real = CanvasRenderingContext2D.prototype.fillText; window.labels = [];
+    CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+        const at = this.getTransform(), width = this.measureText(text).width;
+        const left = at.e + x - (this.textAlign === "center" ? width / 2 : 0);
+        if (/[0-9]:|-[0-9]/.test(text)) window.labels.push([Math.round(at.f + y), left, left + width]);
+        real.call(this, text, x, y); }; })()"""
+
+
+@pytest.mark.parametrize("width", [1400, 380])
+def test_times_along_the_history_do_not_overlap(address: str, browser: Any, width: int) -> None:
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    page.add_init_script(NOTED)
+    page.goto(address + PAGES["vehicle"])
+    page.wait_for_timeout(900)
+    for name in ("1 min", "10 min", "1 h", "1 d", "7 d", "30 d"):
+        page.evaluate("window.labels = []")
+        page.get_by_role("button", name=name, exact=True).click()
+        page.wait_for_timeout(900)
+        drawn = {tuple(label) for label in page.evaluate("window.labels")}
+        for row in {top for top, *_ in drawn}:
+            across = sorted((left, right) for top, left, right in drawn if top == row)
+            assert all(a[1] < b[0] for a, b in pairwise(across)), (name, across)
+    page.close()
+
+
 def test_the_fleet_is_searched_filtered_and_followed(served: tuple[str, Core], browser: Any, system: System) -> None:
     """What happens shows without a reload."""
     address, core = served
@@ -313,6 +340,7 @@ def test_axe_finds_nothing_serious_in_the_description_of_the_api(address: str, b
     page.locator(".opblock-summary-control").first.click()
     page.locator(".opblock-body").first.wait_for()
     page.wait_for_timeout(500)
+    assert page.locator("main").count() == 1
     assert serious(page) == [] and page.locator("h1.title").get_attribute("aria-level") == "2"
     context.close()
 

@@ -8,7 +8,6 @@ follow();
 // What Swagger UI leaves unnamed for who hears the page, or walks it by keys
 const swagger = document.getElementById("swagger");
 const named = {
-  "main#operations": () => ({ role: "group", "aria-label": "Operations" }), // the page has a main part already
   "h1.title": () => ({ "aria-level": "2" }), // below the page's own
   "table.responses-table": (e) => ({ "aria-label": `Answers of ${operationOf(e)}` }),
   "select:not([aria-label])": (e) => ({ "aria-label": nameOf(e) }),
@@ -30,7 +29,16 @@ function name() {
 }
 new MutationObserver(name).observe(swagger, { childList: true, subtree: true });
 
+// The page has a main part already: the one of Swagger UI is made a group
+const oneMain = ({ React }) => {
+  const create = React.createElement;
+  React.createElement = (type, props, ...children) =>
+    type === "main" ? create("div", { ...props, role: "group", "aria-label": "Operations" }, ...children) : create(type, props, ...children);
+  return {};
+};
+
 SwaggerUIBundle({
+  plugins: [oneMain],
   url: "/openapi.json",
   dom_id: "#swagger",
   docExpansion: "list",

@@ -77,6 +77,7 @@
       ...data.marks.map((m) => ({ time: m.time, text: m.kind, colour: style("--good") })),
     ];
     ctx.font = `${11 * devicePixelRatio}px system-ui`;
+    ctx.textAlign = "left";
     moments.forEach(({ time, text, colour }, i) => {
       const px = u.valToPos(Date.parse(time) / 1e3, "x", true);
       if (px < u.bbox.left || px > u.bbox.left + u.bbox.width) return;
@@ -86,24 +87,36 @@
       ctx.moveTo(px, u.bbox.top);
       ctx.lineTo(px, u.bbox.top + u.bbox.height);
       ctx.stroke();
-      ctx.fillText(text, px + 4, u.bbox.top + (12 + 13 * (i % 4)) * devicePixelRatio);
+      const over = px + 4 + ctx.measureText(text).width > u.bbox.left + u.bbox.width; // it stands on the other side
+      ctx.fillText(text, over ? px - 4 - ctx.measureText(text).width : px + 4, u.bbox.top + (12 + 13 * (i % 4)) * devicePixelRatio);
     });
     ctx.restore();
   }
 
-  const DAY = "\n{YYYY}-{MM}-{DD}";
-  const DATES = [ // how ticks are written by their distance in s: dates with their year, 24 hours
-    [31536000, "{YYYY}", null, null, null, null, null, null, 1],
-    [2419200, "{MMM}", "\n{YYYY}", null, null, null, null, null, 1],
-    [86400, "{MM}-{DD}", "\n{YYYY}", null, null, null, null, null, 1],
-    [60, "{HH}:{mm}", DAY, null, DAY, null, null, null, 1],
-    [1, ":{ss}", `${DAY} {HH}:{mm}`, null, `${DAY} {HH}:{mm}`, null, "\n{HH}:{mm}", null, 1],
-    [0.001, ":{ss}.{fff}", `${DAY} {HH}:{mm}`, null, `${DAY} {HH}:{mm}`, null, "\n{HH}:{mm}", null, 1],
-  ];
-  const axes = (dates = true) => {
+  // how ticks are written that are so many s apart: slices of 2026-09-21T14:32:05.500Z for the first line, and for a
+  // second one where that changes
+  const TICKS = [[31536000, [0, 4]], [2419200, [0, 7]], [86400, [5, 10], [0, 4]], [60, [11, 16], [0, 10]], [1, [16, 19], [11, 16]], [0, [16, 23], [11, 16]]];
+  const CHARACTER = 7; // px, of a label
+
+  function dates(u, splits, axis, space, step) {
+    const [, upper, lower] = TICKS.find(([seconds]) => step >= seconds);
+    const times = splits.map((t) => new Date(t * 1e3).toISOString());
+    if (!lower) return times.map((t) => t.slice(...upper));
+    const whole = (t) => (lower[0] ? `${t.slice(0, 10)} ${t.slice(...lower)}` : t.slice(...lower));
+    const changed = (i) => times[i].slice(0, lower[1]) !== times[i - 1].slice(0, lower[1]);
+    const below = times.map((t, i) => (i && !changed(i) ? "" : i && t.slice(0, 10) === times[i - 1].slice(0, 10) ? t.slice(...lower) : whole(t)));
+    const next = below.findIndex((text, i) => i && text);
+    if (next > 0 && (2 * next * space) / CHARACTER < below[0].length + below[next].length + 2) { // they would overlap
+      below[0] = "";
+      below[next] = whole(times[next]);
+    }
+    return times.map((t, i) => t.slice(...upper) + (below[i] && `\n${below[i]}`));
+  }
+
+  const axes = (clock = true) => {
     const grid = { stroke: style("--line"), width: 1 };
     const across = { stroke: style("--soft"), grid, ticks: grid };
-    return [dates ? { ...across, values: DATES } : across, { stroke: style("--soft"), grid, ticks: grid, size: 70 }];
+    return [clock ? { ...across, values: dates } : across, { stroke: style("--soft"), grid, ticks: grid, size: 70 }];
   };
 
   const hold = (answer) => Math.max(answer.resolution, data.hop); // s that a point stands for
@@ -155,7 +168,7 @@
     const scales = range ? { x: { min: range[0], max: range[1] } } : {};
     plots = [new uPlot({ width, height: 320, series, bands, hooks, cursor, scales, tzDate: utc, axes: axes() }, columns.slice(0, -1), at("plot"))];
     const lower = { label: "windows a point", stroke: style("--soft"), fill: style("--band"), paths: uPlot.paths.bars({ size: [1, 30] }) };
-    plots.push(new uPlot({ width, height: 130, series: [series[0], lower], cursor, scales, tzDate: utc, axes: axes() }, [columns[0], columns.at(-1)], at("lower")));
+    plots.push(new uPlot({ width, height: 130, series: [series[0], lower], cursor, scales: { ...scales, y: { range: (_, low, most) => [0, Math.max(most, 1)] } }, tzDate: utc, axes: axes() }, [columns[0], columns.at(-1)], at("lower")));
     plots.forEach((plot) => plot.over.addEventListener("dblclick", () => { range = null; load(); }));
     const step = answer.resolution ? `one point is ${answer.resolution} s` : "single windows";
     at("shown").textContent = `${time.length} points, ${step}`;

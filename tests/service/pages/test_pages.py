@@ -32,6 +32,13 @@ def test_a_page_that_does_not_exist_is_said_in_a_page(client: TestClient, path: 
         assert (plain.status_code, plain.headers["content-type"]) == (404, "application/problem+json")
 
 
+def test_a_vehicle_of_which_nothing_was_heard_is_not_called_good(client: TestClient, core: Core) -> None:
+    core.pipeline.process("new", [])
+    for path in ("/", "/pages/vehicles/new"):
+        page = client.get(path, headers=BROWSER).text
+        assert "no window yet" in page and '<span class="badge ok">' not in page
+
+
 def test_a_page_never_repeats_a_path_as_markup(client: TestClient) -> None:
     answer = client.get("/pages/vehicles/%3Cscript%3E", headers=BROWSER)
     assert answer.status_code == 404 and "<script>" not in answer.text and "&lt;script&gt;" in answer.text
