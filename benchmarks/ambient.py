@@ -60,14 +60,14 @@ def accuracy(rides: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]:
             values = np.full((round(seconds * SAMPLE_RATE), 12), np.nan)
             values[:, rows] = record(rng, ride, seconds)[:, rows]
             begin = time.process_time()
-            told = AmbientIdentifier(system).told(values)
+            fit = AmbientIdentifier(system).fit(values)
             spent.append(time.process_time() - begin)
-            if told is None:
-                raise RuntimeError(f"ride {number} of seed {seed} told nothing")
-            error.append(told.log_ratio - np.append(ride.log_ratio, ride.load))
-            std.append(np.sqrt(np.diag(told.covariance)))
+            if fit is None:
+                raise RuntimeError(f"ride {number} of seed {seed} determined nothing")
+            error.append(fit.log_ratio - np.append(ride.log_ratio, ride.load))
+            std.append(np.sqrt(np.diag(fit.covariance)))
             least.append(bound(vehicle, ride, rows, seconds))
-            fits.append(told.chi_square)
+            fits.append(fit.chi_square)
         yield from _figures(name, rides, seconds, np.array(error), np.array(std), np.array(least))
         yield {
             "figure": "windows",
@@ -149,12 +149,12 @@ def verdict(rng: np.random.Generator, values: Array, seconds: float) -> tuple[in
         ride = replace(draw_ride(rng), log_ratio=values)
         seen = np.full((round(seconds * SAMPLE_RATE), 12), np.nan)
         seen[:, TWO] = record(rng, ride, seconds)[:, TWO]
-        told = identifier.told(seen)
-        if told is None:
+        fit = identifier.fit(seen)
+        if fit is None:
             continue
-        precision = np.linalg.inv(told.covariance[:24, :24])
+        precision = np.linalg.inv(fit.covariance[:24, :24])
         information += precision - np.eye(24) / LOOSE**2
-        pull += precision @ told.log_ratio[:24]
+        pull += precision @ fit.log_ratio[:24]
     evidence, size = [], []
     for i in range(24):
         prior = np.full(24, SCATTER**-2.0)

@@ -33,7 +33,7 @@ class Account:
     more_problems: int = 0  # that are not kept
     incomplete: bool = False  # something that was recorded could not be read
     vehicle: str | None = None
-    relative: bool = False  # its times count from a start that the recording does not tell
+    relative: bool = False  # its times count from an unknown start
     contents: Counter[str] = field(default_factory=Counter)  # topic or CAN id -> messages in the input
 
     def drop(self, count: int, reason: str) -> None:
@@ -67,6 +67,6 @@ class Account:
         self.problems[-1] = f"and {self.more_problems} more like these"
 
     def note(self, line: str) -> None:
-        """One line for the user about how the recording was read; said once, and nothing is missing for it."""
+        """One line for the user about how the recording was read; once per text; no data are missing because of it."""
         if line not in self.problems:
             self.problem(line, incomplete=False)

@@ -23,7 +23,7 @@ NO_FRAME = "other event"
 
 
 class _Header:
-    """What the header lines have said so far."""
+    """Contents of the header lines read so far."""
 
     def __init__(self) -> None:
         self.start = 0  # ns since epoch

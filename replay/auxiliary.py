@@ -43,7 +43,7 @@ class AuxiliaryMeans:
         return SampleBlock(block.time[own], block.channel[own], block.value[own])
 
     def to(self, window: Window) -> Window:
-        """The window with what was measured beside it."""
+        """The window with the means of auxiliary signals."""
         if not self._held:
             return window
         self._done = window.start

@@ -53,7 +53,7 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
     yield from reader.flush()
     _check_stop(reader, fields[22:30], account)
     if reader.tail.strip(b"\0"):
-        account.problem(f"file ends inside an object after {reader.seconds:.1f} s; what came before was read")
+        account.problem(f"file ends inside an object after {reader.seconds:.1f} s; everything before was read")
     expected = fields[12]  # number of objects that the writer counted; 0 when it did not finish
     if account.incomplete and expected > reader.objects:
         account.corrupt(expected - reader.objects, "in a part of the file that cannot be read")
@@ -64,7 +64,7 @@ def _containers(file: BinaryIO, file_size: int, account: Account) -> Iterator[by
     inflater = Inflater(file_size)
     while base := file.read(OBJECT_BASE.size):
         if len(base) < OBJECT_BASE.size:
-            account.problem("file ends inside a container header; what came before was read")
+            account.problem("file ends inside a container header; everything before was read")
             return
         at = file.tell() - OBJECT_BASE.size
         signature, _, _, size, kind = OBJECT_BASE.unpack(base)
@@ -77,13 +77,13 @@ def _containers(file: BinaryIO, file_size: int, account: Account) -> Iterator[by
         body = file.read(size - OBJECT_BASE.size)
         cut = len(body) < size - OBJECT_BASE.size
         if cut and (later := _next_container(body)) is not None:  # the size is wrong, not the file's end
-            account.problem(f"the object at byte {at} says that it is {size} bytes long: damaged")
+            account.problem(f"the object at byte {at} has an impossible length of {size} bytes: damaged")
             yield None
             file.seek(at + OBJECT_BASE.size + later)
             continue
         file.read(size % 4)
         if cut:
-            account.problem("file ends inside a container; what came before the cut was read")
+            account.problem("file ends inside a container; everything before was read")
         if kind != CONTAINER_TYPE:
             yield base + body
         elif len(body) >= CONTAINER.size:
@@ -135,7 +135,7 @@ def _seek_object(file: BinaryIO, position: int) -> bool:
 
 
 def _check_stop(reader: _Objects, fields: tuple[int, ...], account: Account) -> None:
-    """The header has no checksum; start and stop in it and the frames' own times say whether they belong together."""
+    """The header has no checksum; start and stop in it and the frames' own times show whether they are consistent."""
     stop = _moment(fields)
     if not stop or not reader.start or not reader.objects:
         return

@@ -1,4 +1,4 @@
-"""What a file says that it holds, looked at before it is read: what is not plausible for its size is refused.
+"""Sizes that a file declares, checked before it is read: values implausible for its length are refused.
 
 Packages of others read whole series, make room for what a file states, and inflate what is packed without asking.  Here
 are the bounds for all of them, and the sizes that MATLAB and MDF files state, without more than a piece in memory.

@@ -1,4 +1,4 @@
-"""CAN interfaces: how a bus is named, opened without disturbing it, filtered, and asked what it has lost."""
+"""CAN interfaces: naming, opening in listen-only mode, filtering, and counts of lost frames."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class BusAddress:
 
 
 def parse_bus(text: str) -> BusAddress:
-    """Raises UnreadableRecording with one line that says how a bus is named."""
+    """Raises UnreadableRecording with the syntax of bus names."""
     place, *pairs = text.split(",")
     interface, separator, channel = place.partition(":")
     if not separator or not interface or not channel:
@@ -62,7 +62,7 @@ def parse_bus(text: str) -> BusAddress:
 
 
 def opening_options(address: BusAddress, ids: Iterable[int] | None) -> dict[str, Any]:
-    """What python-can is told beside interface and channel: listen only and filter, where the interface can; what
+    """Options of python-can beside interface and channel: listen-only mode and filters, if supported; what
     the user named goes before.  ids: wanted frames, with EXTENDED; None: all."""
     options = dict(LISTEN_ONLY.get(address.interface, {}))
     if ids is not None and address.interface in FILTERS_IN_KERNEL:
@@ -88,7 +88,7 @@ def widen(bus: can.BusABC) -> None:
 
 
 def lost_by_kernel(bus: can.BusABC, address: BusAddress) -> int:
-    """Frames that the interface or the socket has dropped since it was opened; 0 where nobody counts them."""
+    """Frames that the interface or the socket has dropped since it was opened; 0 if they are not counted."""
     lost = 0
     sock = getattr(bus, "socket", None)
     if isinstance(sock, socket.socket):

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 from sprung.replay.windowing import Windower
 
-STRAY = {  # what `Windower.reasons` calls samples that belong to no window, and what a user is told
+STRAY = {  # what `Windower.reasons` calls samples that belong to no window, and the message to users
     "late": "too late",
     "stray time stamp": "at times of which no others are",
     "too many samples for their time": "at nearly the same time",

@@ -33,7 +33,7 @@ class TableLayout:
     comma: bool  # the decimal sign is a comma
     skip: int  # lines before the first row of data
     names: tuple[str, ...]  # of the columns; "1", "2", ... when there is no header
-    units: tuple[str | None, ...]  # of the columns, as a row of units or the header says
+    units: tuple[str | None, ...]  # of the columns, from a row of units or the header
     headed: bool
     numeric: tuple[bool, ...]  # which columns hold numbers or times
     timed: bool = False  # without a header: whether the first column rises, as times do
@@ -49,7 +49,7 @@ def cells(line: str, separator: str | None) -> list[str]:
 
 
 def number(cell: str, comma: bool) -> float:
-    """The value of a cell, NaN where it says that there is none; raises ValueError."""
+    """The value of a cell, NaN for markers of missing values; raises ValueError."""
     text = cell.replace(",", ".") if comma else cell
     if _NUMBER.match(text):
         return float(text.replace("d", "e").replace("D", "e"))
@@ -87,18 +87,12 @@ def _ways(lines: list[str]) -> Iterator[tuple[str | None, bool]]:
 
 
 def _try(lines: list[str], separator: str | None, comma: bool) -> tuple[float, TableLayout] | None:
-    """How many cells are understood this way, and the layout."""
-    rows: list[list[str]] = []
-    for line in lines:
-        try:
-            rows.append([] if not line.strip() or line.lstrip().startswith(COMMENTS) else cells(line, separator))
-        except csv.Error:
-            rows.append([])
+    """Score of a reading of the lines, by the number of cells that are understood, and its layout; None if none."""
+    rows = [_cells_of(line, separator) for line in lines]
     good = [[is_number(cell, comma) or is_written(cell) for cell in row] for row in rows]
-    widths = Counter(len(row) for row, ok in zip(rows, good, strict=True) if any(ok) and 2 * sum(ok) >= len(row))
-    if not widths:
+    width = _width(rows, good)
+    if not width:
         return None
-    width = max(widths, key=lambda w: (widths[w] * w, w))
     of_width = [i for i, row in enumerate(rows) if len(row) == width]
     numeric = [sum(good[i][c] for i in of_width) > 0.5 * len(of_width) for c in range(width)]
     if not any(numeric):
@@ -111,6 +105,22 @@ def _try(lines: list[str], separator: str | None, comma: bool) -> tuple[float, T
     others = sum(len(row) not in (0, width) for row in rows[first:])
     score = understood - 2.0 * others - 0.5 * sum(len(data) * (not n) for n in numeric)
     return score, _layout(lines, rows, first, tuple(numeric), separator, comma)
+
+
+def _cells_of(line: str, separator: str | None) -> list[str]:
+    """The cells of a line; none in comments, empty lines and lines that cannot be split."""
+    if not line.strip() or line.lstrip().startswith(COMMENTS):
+        return []
+    try:
+        return cells(line, separator)
+    except csv.Error:
+        return []
+
+
+def _width(rows: list[list[str]], good: list[list[bool]]) -> int:
+    """The number of columns of the rows that hold mostly numbers; 0 if there are none."""
+    widths = Counter(len(row) for row, ok in zip(rows, good, strict=True) if any(ok) and 2 * sum(ok) >= len(row))
+    return max(widths, key=lambda width: (widths[width] * width, width), default=0)
 
 
 def _is_data(row: list[str], good: list[bool], numeric: list[bool]) -> bool:
@@ -129,27 +139,38 @@ def _layout(
 ) -> TableLayout:
     """Header and units from the lines before the first row of data."""
     width = len(numeric)
-    above = [(i, row) for i, row in enumerate(rows[:first]) if len(row) == width and any(row)]
-    marked = [  # the header may itself be a comment
-        (i, cells(lines[i].lstrip().lstrip("".join(COMMENTS)).strip(), separator))
-        for i in range(first)
-        if not rows[i] and lines[i].lstrip().startswith(COMMENTS) and '"' not in lines[i]
-    ]
-    heads = above or [(i, row) for i, row in marked if len(row) == width]
+    heads = _headers(lines, rows[:first], width, separator)
     if not heads:
-        names = [str(c + 1) for c in range(width)]
+        names = tuple(str(c + 1) for c in range(width))
         begin = [row[0] for row in rows[first:] if len(row) == width]
-        return TableLayout(
-            separator, comma, first, tuple(names), (None,) * width, False, numeric, timed=_rises(begin, comma)
-        )
-    names = heads[-1][1]
-    units: list[str | None] = [None] * width
-    if len(heads) > 1 and _are_units(heads[-1][1]):
-        names, units = heads[-2][1], [_bare(cell) for cell in heads[-1][1]]
-    elif len(heads) > 2 and _are_units(heads[-2][1]):  # another row below the units
-        names, units = heads[-3][1], [_bare(cell) for cell in heads[-2][1]]
-    units = [unit or unit_in(name)[1] for name, unit in zip(names, units, strict=True)]
-    return TableLayout(separator, comma, first, tuple(names), tuple(units), True, numeric)
+        timed = _rises(begin, comma)
+        return TableLayout(separator, comma, first, names, (None,) * width, False, numeric, timed=timed)
+    names, units = _names_and_units(heads)
+    return TableLayout(separator, comma, first, names, units, True, numeric)
+
+
+def _headers(lines: list[str], rows: list[list[str]], width: int, separator: str | None) -> list[list[str]]:
+    """Rows of the table's width above the data; if there are none, comments that have it."""
+    above = [row for row in rows if len(row) == width and any(row)]
+    if above:
+        return above
+    comments = [
+        cells(line.lstrip().lstrip("".join(COMMENTS)).strip(), separator)
+        for line, row in zip(lines, rows, strict=False)
+        if not row and line.lstrip().startswith(COMMENTS) and '"' not in line
+    ]
+    return [row for row in comments if len(row) == width]
+
+
+def _names_and_units(heads: list[list[str]]) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
+    """Names and units of the columns from the rows above the data."""
+    names: list[str] = heads[-1]
+    units: list[str | None] = [None] * len(names)
+    if len(heads) > 1 and _are_units(heads[-1]):
+        names, units = heads[-2], [_bare(cell) for cell in heads[-1]]
+    elif len(heads) > 2 and _are_units(heads[-2]):  # another row below the units
+        names, units = heads[-3], [_bare(cell) for cell in heads[-2]]
+    return tuple(names), tuple(unit or unit_in(name)[1] for name, unit in zip(names, units, strict=True))
 
 
 def _rises(column: list[str], comma: bool) -> bool:

@@ -26,9 +26,9 @@ SLOWEST = 0.5  # own rate / grid rate below which a channel cannot be interpolat
 REACH = 8  # grid periods of context that resampling and repair look at on either side
 KAISER_BETA = 7.0  # stop band -70 dB
 NEIGHBOURS = 3  # valid samples on either side that a repair uses
-FEWEST = 4  # samples below which a channel's clock cannot be told
+FEWEST = 4  # samples below which a channel's clock cannot be estimated
 MOST_EVEN, SCATTER = 64, 0.005  # samples, and scatter of stamps in periods, below which it does not matter
-SMOOTH_ORDER, SURE = 4, 5.0  # of the differences that tell; deviations from which they do
+SMOOTH_ORDER, SURE = 4, 5.0  # order of the differences; significance in deviations
 EVEN, WELL_EVEN = 0.45, 0.9  # resultant length of phases: the stamps have an even clock; they show it clearly
 PUNCTUAL = 0.2  # share of samples with about the least delay, without which it is no delay but disorder
 STEADY = 0.45  # grid periods by which the least delay may change while no sample is lost
@@ -77,7 +77,7 @@ class Resampled:
 
     value: FloatArray  # (R,); NaN where the channel has a gap
     bridged: BoolArray  # (R,) the nearest sample was missing and has been interpolated
-    rate: float  # own rate / grid rate; 0 when the channel has too few samples to tell
+    rate: float  # own rate / grid rate; 0 if the channel has too few samples
     even: bool  # False: the time stamps fit no even clock, every value is NaN
 
 
@@ -137,7 +137,7 @@ def uneven(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: int
 
 
 def taken_at_stamps(offset: FloatArray, value: FloatArray) -> bool:
-    """Whether samples were taken when their stamps say, rather than on the even clock that the stamps scatter about.
+    """Whether samples were taken at their time stamps, rather than by an even clock about which the stamps scatter.
 
     A sample that is taken early or late by e shows the signal's slope times e more than an even one.  Differences of
     high order of the values, which leave nothing of a smooth signal, are regressed on those of slope times e: the

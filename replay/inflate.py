@@ -1,4 +1,4 @@
-"""Decompression with a hard bound: what a few bytes inflate to is never more than is plausible for a recording.
+"""Decompression with a hard bound, plausible for recordings, on the inflated size.
 
 Every decompressor runs as a stream that is stopped one byte beyond the size that the container states, so a false
 statement costs no more than the true size would.
@@ -38,7 +38,7 @@ class Inflater:
             if method not in METHODS:
                 raise ValueError(f"unknown compression {method!r}")
             if size > max(ALWAYS, min(LARGEST, RATIO * len(packed))):
-                raise ValueError(f"it says that {len(packed)} bytes inflate to {size}: not plausible")
+                raise ValueError(f"{len(packed)} bytes are declared to inflate to {size}: not plausible")
             if size > self._left:
                 raise ValueError("the file inflates to more than is plausible for its size")
             self._left -= size

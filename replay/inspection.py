@@ -23,7 +23,7 @@ GAP = 2.5  # periods without a sample
 STILL_SECONDS, STILL_SHARE = 1.0, 0.005  # least length of a standstill; range in it over that of the whole channel
 MOST_STILL = 20  # stretches that are listed
 MOST_LEVELS = 20_000  # samples in which the resolution is looked for
-ORDER = 4  # of the differences that tell the noise
+ORDER = 4  # order of the differences for the noise level
 BAND = (0.05, 0.95)  # shares of the power below the ends of the band
 
 
@@ -184,7 +184,7 @@ def _spectrum(signal: Signal, value: FloatArray) -> None:
 
 
 def _standstill(elapsed: FloatArray, value: FloatArray, period: float, noise: float) -> list[tuple[float, float]]:
-    """Stretches in which the signal does not move beside what it does elsewhere."""
+    """Stretches in which the signal hardly moves compared with the rest."""
     width = max(int(STILL_SECONDS / period), 8)
     blocks = len(value) // width
     whole = float(np.ptp(value))

@@ -1,6 +1,6 @@
 """JSON of strangers: objects that name a key twice, integers of thousands of digits.
 
-Parsers keep the last value of a key in silence, and the first may be what was meant.
+Parsers silently keep the last value of a repeated key, while the first may be the intended one.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ MOST_CHANNELS = 2_000
 MOST_ELEMENTS = 64  # of an array in a message that are listed
 DEEPEST = 6
 NO_TIME = (
-    "no column of times is recognised, so rates are per sample and times count samples; say `time: {column: NAME}` "
+    "no column of times is recognised, so rates are per sample and times count samples; set `time: {column: NAME}` "
     "or `time: {rate: HZ}`"
 )
 
@@ -95,7 +95,7 @@ def _series(path: Path, columns: list[Column], time: TimeColumn, notes: list[str
             others.append(column)
     if not timed:
         if time.name is not None:
-            time_of(path, columns[0], columns, time)  # tells what is wrong with the name
+            time_of(path, columns[0], columns, time)  # raises for an unknown name
         notes.append(NO_TIME)
         return [(column.name, column.unit) for column in columns], TimeColumn(rate=1.0)
     if others:

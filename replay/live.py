@@ -82,7 +82,7 @@ class LiveBus:
 
     @property
     def tally(self) -> Tally:
-        """Frames so far, by what became of them."""
+        """Frames so far, by outcome."""
         return self.account.tally
 
     @property
@@ -119,7 +119,7 @@ class LiveBus:
                 self.connected = False
 
     def _receive(self, bus: can.BusABC) -> Iterator[list[can.Message]]:
-        """Frames collected for one latency; raises what the bus raises."""
+        """Frames collected during one latency.  Errors: those of the bus."""
         while not self.stop.is_set():
             self.beat = time.monotonic()
             message = bus.recv(timeout=self._latency)
@@ -133,7 +133,7 @@ class LiveBus:
                     if message is not None:
                         messages.append(message)
             except BUS_ERRORS:
-                yield messages  # what came before the bus was lost still counts
+                yield messages  # frames received before the bus was lost
                 raise
             yield messages
 
@@ -143,7 +143,7 @@ class LiveBus:
         self._lost_before = lost_by_kernel(bus, self.address)
 
     def _ask(self, bus: can.BusABC) -> None:
-        """Add what the kernel has dropped since the last look."""
+        """Add the frames dropped by the kernel since the last call."""
         now = time.monotonic()
         if now - self._asked < ASK_SECONDS:
             return
@@ -156,8 +156,8 @@ class LiveBus:
         self._lost_before = lost
 
     def _note_errors(self, messages: list[can.Message]) -> None:
-        """A controller that took itself off the bus hears nothing until it is restarted: it says so once."""
-        if self.address.interface != "socketcan":  # others tell in ways of their own
+        """Report once that a controller is off the bus: it receives nothing until it is restarted."""
+        if self.address.interface != "socketcan":  # other interfaces report it differently
             return
         for message in messages:
             off = message.is_error_frame and bool(message.arbitration_id & ERROR_BUS_OFF)

@@ -23,7 +23,7 @@ _SEPARATORS = {"tab": "\t", "comma": ","}
 
 @dataclass(frozen=True, slots=True)
 class _Segment:
-    """One block of rows with what its header says of every column."""
+    """One block of rows with its header's description of every column."""
 
     header: Mapping[str, Sequence[str]]
     names: Sequence[str]
@@ -34,7 +34,7 @@ def columns(path: Path) -> list[Column]:
     """The channels by their names; `name #2` where a further segment has the same one.  Errors: UnreadableRecording."""
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     if not lines or not lines[0].startswith("LabVIEW Measurement"):
-        raise UnreadableRecording(f"{path}: not a LabVIEW measurement file (its first line says 'LabVIEW Measurement')")
+        raise UnreadableRecording(f"{path}: not a LabVIEW measurement file (whose first line is 'LabVIEW Measurement')")
     start = next((i + 1 for i, line in enumerate(lines) if line.startswith(END)), len(lines))
     head = (line.split("\t") if "\t" in line else line.split(",") for line in lines[:start])
     words = {cells[0]: cells[1:] for cells in head}
@@ -112,7 +112,7 @@ def _clock(header: Mapping[str, Sequence[str]], place: int) -> EvenTimes | None:
 
 
 def _nanoseconds(day: str, hour: str) -> int:
-    """Since the Unix epoch; the file states no zone, and UTC is taken for it."""
+    """Since the Unix epoch; the file states no time zone; UTC is assumed."""
     whole_seconds, _, fraction = hour.replace(",", ".").partition(".")
     when = datetime.strptime(f"{day} {whole_seconds}", "%Y/%m/%d %H:%M:%S").replace(tzinfo=UTC)
     return int(when.timestamp()) * SECOND + round(float(f"0.{fraction or 0}") * SECOND)

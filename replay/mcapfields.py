@@ -69,10 +69,10 @@ class Topic:
         self._stamp: tuple[tuple[str, ...], tuple[str, str]] | None = None  # where the messages carry their time
         for factory in () if self.is_json else (Ros2Factory(), ProtobufFactory()):
             try:
-                # the parser of ROS 2 definitions prints what it cannot read
+                # the parser of ROS 2 definitions prints its errors
                 with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                     self.decode = self.decode or factory.decoder_for(channel.message_encoding, schema)
-            except Exception as error:  # the decoders' parsers raise what they happen to raise
+            except Exception as error:  # decoders raise arbitrary errors
                 account.problem(f"schema of topic {self.name} cannot be read: {_words(error)}")
         if self.decode is None:
             account.problem(f"topic {self.name}: encoding {channel.message_encoding!r} cannot be read here")
@@ -150,7 +150,7 @@ class Topic:
         return np.array([_stamp_ns(walk(item, path), parts) for item in documents], dtype=np.int64)
 
     def _check_fields(self, document: Any) -> None:
-        """Once: say which wanted fields the first message does not have."""
+        """Report once which wanted fields are missing in the first message."""
         if self._checked:
             return
         self._checked = True

@@ -27,7 +27,7 @@ from sprung.replay.inflate import ERRORS, Inflater
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_SIZE_LIMIT = 1 << 28  # bytes of a record that is read; attachments are passed over and may be longer
-PIECE = 1 << 20  # bytes read at once of what is only passed over
+PIECE = 1 << 20  # bytes read at once of skipped records
 BATCH_MESSAGES = 4096  # messages outside chunks that are handed out together
 DISORDER = 250_000_000  # ns that messages may lie back in time without being sorted; less than a window waits
 PREFIX = struct.Struct("<BQ")  # opcode, length
@@ -37,7 +37,7 @@ FOOTER = struct.Struct("<QQI")  # summary start, summary offsets start, summary 
 DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of the data section
 READ = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.METADATA)
 DAMAGED = "a damaged chunk"
-UNREADABLE = (ValueError, struct.error, McapError)  # what the records of the `mcap` package raise
+UNREADABLE = (ValueError, struct.error, McapError)  # errors of the `mcap` package
 
 
 @dataclass(slots=True)
@@ -55,7 +55,7 @@ Batch = dict[int, Messages]  # by channel id
 
 @dataclass(slots=True)
 class Summary:
-    """What the end of an intact file says about it."""
+    """Summary section at the end of an intact file."""
 
     chunks: list[ChunkIndex] = field(default_factory=list)
     messages: int = 0
@@ -127,7 +127,7 @@ class McapFile:
             self.account.problem("the CRC of the data section is wrong: something outside the chunks is damaged")
 
     def _pass_over(self, file: BinaryIO, prefix: bytes, length: int) -> None:
-        """A record that nobody needs (an attachment may be long)."""
+        """Skip a record that is not needed (attachments may be long)."""
         if self._crc is None:
             file.seek(length, 1)
             return
@@ -199,7 +199,7 @@ class McapFile:
 
     def _resume(self, file: BinaryIO, at: int, summary: Summary | None, opcode: int) -> bool:
         """After a record that cannot be right: place the file at the next chunk of the index, if there is one."""
-        self._crc = None  # the damage is found and told
+        self._crc = None  # the damage is reported already
         if summary is not None:
             later = bisect_right(summary.starts, at)
             found = later < len(summary.starts)

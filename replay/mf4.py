@@ -39,10 +39,10 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
                 start = round(mdf.header.start_time.timestamp() * 1e6) * 1_000
                 groups = list(_groups(mdf, account))
                 mdf_version = mdf.version
-        except Exception as error:  # asammdf raises what its parser happens to raise, and says it to its authors
+        except Exception as error:  # asammdf raises arbitrary errors
             wrong = type(error).__name__
         if wrong:
-            gc.collect()  # what was left half made complains at its end: here, where nobody listens
+            gc.collect()  # incomplete objects warn when collected: do it here, with warnings off
     if wrong:
         version = head[8:].decode("ascii", "replace").strip(" \0") or "?"
         raise UnreadableRecording(
@@ -96,7 +96,7 @@ def _of_asammdf(thing: Any) -> bool:
 
 
 def _groups(mdf: Any, account: Account) -> Iterator[tuple[Any, Any, Any, Any]]:
-    """The groups of CAN frames; one that cannot be read is told and passed over."""
+    """The groups of CAN frames; unreadable ones are reported and skipped."""
     for index in range(len(mdf.groups)):
         try:
             found = _group(mdf, index)

@@ -38,7 +38,7 @@ def blocks(path: Path, channels: Sequence[Channel], account: Account, time: Time
 
 
 def stamped(schema: Any, time: TimeColumn) -> TimeColumn:
-    """Where the times are: where no name says so, in the only column of time stamps, such as a data frame's index."""
+    """Location of the times: without a name, the only column of time stamps, such as a data frame's index."""
     import pyarrow as pa
 
     stamps = [field.name for field in schema if pa.types.is_timestamp(field.type)]
@@ -65,7 +65,7 @@ def listing(path: Path, time: TimeColumn) -> tuple[list[tuple[str, str | None]],
 
 
 def units(file: Any) -> list[str | None]:
-    """Units of the columns: the field's metadata `unit`, else what the name holds."""
+    """Units of the columns: the field's metadata `unit`, else the unit in its name."""
     found = []
     for field in file.schema_arrow:
         stated = (field.metadata or {}).get(b"unit") or (field.metadata or {}).get(b"units")

@@ -29,7 +29,7 @@ SENTINELS = np.array(  # what loggers write for "no value": nines, ends of integ
         | {9.969209968386869e36, float(np.float32(9.96921e36)), float(np.finfo(np.float32).max)}
     )
 )
-RANGES = {  # what a channel of a rail vehicle can measure when the system file does not say; far beyond any instrument
+RANGES = {  # of channels of rail vehicles if the system file states none; far beyond any instrument
     "m": (-100.0, 100.0),
     "m/s": (-500.0, 500.0),
     "m/s^2": (-5e3, 5e3),
@@ -53,7 +53,7 @@ def nanoseconds(seconds: FloatArray) -> tuple[IntArray, BoolArray]:
 
 
 class PlausibilityCheck:
-    """Checks blocks on their way from a reader, counts what it finds; `tell` says so at the end."""
+    """Checks blocks on their way from a reader, counts findings; `tell` reports them at the end."""
 
     def __init__(
         self, channels: Sequence[Channel], account: Account, convert: Callable[[SampleBlock], SampleBlock]

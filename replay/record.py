@@ -18,7 +18,7 @@ from sprung.replay.stream import ClockJump, Reorderer
 
 MOST_CELLS = 500_000_000  # rows times channels of one record; 4 GB
 CELLS_ALWAYS, CELLS_PER_SAMPLE = 2_000_000, 50  # and at most so many: a record that is nearly all gaps is none
-TELL_LOSS = 0.01  # share of a channel's samples above which their loss is told
+TELL_LOSS = 0.01  # share of a channel's samples above which their loss is reported
 ROWS_AT_ONCE = 512  # rows that are resampled together, so that memory stays small
 
 

@@ -112,7 +112,7 @@ class Recording:
         if self._start is None or not self.account.relative:
             return 0
         began = datetime.fromtimestamp(self._start / SECOND, UTC).strftime("%Y-%m-%d %H:%M:%S")
-        self.account.note(f"its times count from a start of their own: {began} UTC is taken for it")
+        self.account.note(f"its times count from an unknown start: {began} UTC is assumed")
         return self._start - first
 
     def _nothing(self) -> str:
@@ -126,7 +126,7 @@ class Recording:
 
     @property
     def tally(self) -> Tally:
-        """Messages by what became of them."""
+        """Messages by outcome."""
         return self.account.tally
 
     @property
@@ -179,7 +179,7 @@ def open_recording(
 
     `dbc` is the CAN database that CAN recordings need, a file or already loaded.  `time_source` (MCAP): "auto"
     (header stamp where the messages carry one, else publish time), "header", "publish" or "log"; or a table by
-    channel name.  `time` says where tables keep their times.  `start` (ns since 1970) is when a
+    channel name.  `time`: time column of tables.  `start` (ns since 1970) is when a
     recording began whose times count from 0; without it such times stay as they are.
     `beside` are channels that follow the others and may be missing, such as `System.auxiliary`.
     """
@@ -208,7 +208,7 @@ def _whatever(path: Path, source: Iterator[SampleBlock], account: Account) -> It
     rows = 0
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # told by what comes of it
+            warnings.simplefilter("ignore")  # reported by their consequences
             for block in source:
                 rows += len(block.time)
                 yield block
@@ -218,9 +218,9 @@ def _whatever(path: Path, source: Iterator[SampleBlock], account: Account) -> It
         what = str(error) or type(error).__name__
         if not rows:
             raise UnreadableRecording(
-                f"{path}: damaged, or not of the kind that its name says: {what[:200]}"
+                f"{path}: damaged, or not of the kind that its name suggests: {what[:200]}"
             ) from error
-        account.problem(f"damaged after {rows} values ({' '.join(what.split())[:200]}); what came before was read")
+        account.problem(f"damaged after {rows} values ({' '.join(what.split())[:200]}); everything before was read")
 
 
 def _series(path: Path, channels: Sequence[Channel], account: Account, time: TimeColumn) -> Iterator[SampleBlock]:

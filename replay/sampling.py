@@ -1,4 +1,4 @@
-"""Rates of recorded channels against the grid's: fast ones are reduced, wrong units of time are told.
+"""Rates of recorded channels relative to the grid: fast channels are decimated, wrong units of time are reported.
 
 A channel at about twice the grid's rate or more goes through a linear-phase FIR low pass that is centred on its
 samples (zero phase), computed only where samples are wanted (polyphase; Crochiere and Rabiner, Multirate Digital
@@ -28,7 +28,7 @@ PROBE_SECONDS, PROBE_SAMPLES, PROBE_LIMIT = 3.0, 32, 500_000  # s, samples of ea
 LONGEST_BRIDGE = 8  # own samples in a row that are interpolated before the filter; more begin a new stretch
 JITTER = 3.0  # periods, standard deviation of the stamps about an even clock, above which there is none
 LOST = 0.35  # periods by which the stamps leave an even clock for long when a sample is missing
-SMOOTH = 33  # samples whose median is taken for that
+SMOOTH = 33  # samples of the median for it
 MOST_UP = 16  # of a rational ratio
 LATE = 64  # own samples that may come out of order
 SILENT = 5.0  # s after which the others no longer wait for a fast channel
@@ -71,7 +71,7 @@ def at_rate(
     account: Account,
     path: Path,
 ) -> Iterator[SampleBlock]:
-    """The samples, those of fast channels reduced to the grid's rate; says so in the account.
+    """The samples, fast channels decimated to the grid's rate, with a note in the account.
 
     Errors: UnreadableRecording when every channel is much slower than the grid.
     """
@@ -104,7 +104,7 @@ def at_rate(
 
 
 def _probed(held: list[SampleBlock], channels: int) -> bool:
-    """Whether enough has come to tell the rates."""
+    """Whether enough samples have arrived to estimate the rates."""
     total = sum(len(block.time) for block in held)
     if total >= PROBE_LIMIT:
         return True
@@ -136,10 +136,10 @@ def _refuse_slow(
         account.note(f"slower than half of {sample_rate:g} Hz, so left out: {names} ({1 / period:.3g} Hz)")
         return
     hint = next(
-        (f"if its times are in {unit}, say `time: {{unit: {unit}}}` in the system file; else " for unit, seconds in
+        (f"if its times are in {unit}, set `time: {{unit: {unit}}}` in the system file; else " for unit, seconds in
          (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)) if 0.2 < period * seconds * sample_rate < 200.0), "")  # fmt: skip
     raise UnreadableRecording(
-        f"{path}: its samples come every {period:.4g} s, the system file says sample_rate: {sample_rate:g} Hz; "
+        f"{path}: its samples come every {period:.4g} s, the system file has sample_rate: {sample_rate:g} Hz; "
         f"{hint}set sample_rate to {1 / period:.3g}"
     )
 
@@ -260,7 +260,7 @@ class Reducer:
         return self._work(LATE)
 
     def flush(self) -> tuple[IntArray, FloatArray]:
-        """At the end: what is left."""
+        """The remaining samples, at the end."""
         return self._work(0)
 
     def _work(self, behind: int) -> tuple[IntArray, FloatArray]:

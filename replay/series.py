@@ -67,7 +67,7 @@ def _json(path: Path) -> Iterator[list[Column]]:
 
 
 def _as_float(value: Any) -> float:
-    """NaN for what is missing, and for integers beyond all floats."""
+    """NaN for missing values, and for integers beyond the range of floats."""
     try:
         return np.nan if value is None else float(value)
     except OverflowError:
@@ -187,7 +187,7 @@ def _tdms(path: Path) -> Iterator[list[Column]]:
     from nptdms import TdmsFile
     from nptdms.log import log_manager
 
-    log_manager.set_level(logging.CRITICAL)  # what it logs of damaged files is told by what comes of it
+    log_manager.set_level(logging.CRITICAL)  # damage is reported by its consequences
     raw = path.open("rb")
     try:
         file = TdmsFile.open(raw)

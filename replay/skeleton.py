@@ -1,4 +1,4 @@
-"""The skeleton of a system file for a recording: what the recording tells is filled in, the rest is to be filled in."""
+"""Skeleton of a system file from a recording: known entries are filled in, the others marked."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ WORDS = {  # in names of signals without a unit
 PLAIN = re.compile(r"^[A-Za-z/][\w/.-]*$")
 YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 OVERSAMPLED = 10.0  # times the highest frequency that matters, beyond which a lower rate is proposed
-FINE = 100.0  # the same of a component test: friction and stops are told by what they do within a cycle
+FINE = 100.0  # the same of a component test: friction and stops are identified within a cycle
 FEWEST = 4000  # samples that a lower rate must leave
 LEAST_WINDOW = 64  # samples
 
 
 def kind_of_signal(signal: Signal) -> tuple[str | None, str | None]:
-    """Kind of sensor and the unit to write (None: SI), as far as unit and name tell."""
+    """Kind of sensor and the unit to write (None: SI), if unit or name show it."""
     for si, kind in KINDS.items():
         if signal.unit and known(signal.unit, si) in FACTORS[si]:
             return kind, None if known(signal.unit, si) == si else known(signal.unit, si)
@@ -56,11 +56,7 @@ def sample_rate(inspection: Inspection, oversampled: float = OVERSAMPLED) -> flo
 
 def skeleton(inspection: Inspection, name: str, time: dict[str, object]) -> str:
     """The text; it is a valid system file, with values to be replaced marked by TODO."""
-    usable = [
-        signal
-        for signal in inspection.signals
-        if signal.samples > signal.missing and not (signal.constant or signal.rising or signal.same_as)
-    ]
+    usable = [signal for signal in inspection.signals if _is_usable(signal)]
     kinds = {signal.name: kind_of_signal(signal) for signal in usable}
     motions = [s for s in usable if kinds[s.name][0] in ("displacement", "velocity")]
     forces = [s for s in usable if kinds[s.name][0] == "force"]
@@ -77,16 +73,27 @@ def skeleton(inspection: Inspection, name: str, time: dict[str, object]) -> str:
     if time:
         lines.append(f"time: {{{', '.join(f'{key}: {_text(value)}' for key, value in time.items())}}}")
     lines += _test(motions, forces, kinds) if test else _vehicle(usable, kinds)
-    unknown = [signal for signal in usable if kinds[signal.name][0] is None]
-    if unknown:
-        lines += ["# Not used yet, for neither unit nor name tells what they measure:"]
-        lines += [f"#   {_identifier(s.name)}: {{{_address(s, None)}}}" for s in unknown]
-    if unknown and test:
-        lines += [
-            "# A valve's current or a temperature that parameters may follow: list it under `signals:`, with its unit,"
-        ]
-        lines += ["# and in the element's `depends_on: [NAME]`"]
+    lines += _unknown([signal for signal in usable if kinds[signal.name][0] is None], test=test)
     return "\n".join(lines) + "\n"
+
+
+def _is_usable(signal: Signal) -> bool:
+    """Whether a signal has values of its own that vary."""
+    return signal.samples > signal.missing and not (signal.constant or signal.rising or signal.same_as)
+
+
+def _unknown(signals: list[Signal], *, test: bool) -> list[str]:
+    """Comments on signals of unknown kind."""
+    if not signals:
+        return []
+    lines = ["# Not used yet, since neither unit nor name shows what they measure:"]
+    lines += [f"#   {_identifier(s.name)}: {{{_address(s, None)}}}" for s in signals]
+    if test:
+        lines += [
+            "# A valve's current or a temperature on which parameters may depend: list it under `signals:`, with its",
+            "# unit, and in the element's `depends_on: [NAME]`",
+        ]
+    return lines
 
 
 Kinds = dict[str, tuple[str | None, str | None]]

@@ -26,10 +26,10 @@ SECOND, DAY = 10**9, 86_400 * 10**9  # ns
 
 
 class Stamps:
-    """Turns the cells of one time column into nanoseconds; `account.relative` tells that they count from a start."""
+    """Turns the cells of one time column into nanoseconds; `account.relative` is set if they count from a start."""
 
     def __init__(self, time: TimeColumn, unit: float | None, account: Account) -> None:
-        """`unit`: what the column's header says that one of it is, s."""
+        """`unit`: of the column by its header, s."""
         self.time = time
         self.seconds = time.seconds or unit
         self.account = account
@@ -72,14 +72,14 @@ class Stamps:
                 for least, seconds, name in _MAGNITUDES:
                     if size > least:
                         self.seconds = seconds
-                        self.account.note(f"times of this size are taken for {name} since 1970")
+                        self.account.note(f"times of this size are interpreted as {name} since 1970")
                         break
         exact = Fraction(self._first) * Fraction(self.seconds).limit_denominator(10**9)
         self._base = round(exact * SECOND) + (self.time.epoch or 0)
         self.account.relative = self.time.epoch is None and abs(self._base) < ABSOLUTE * SECOND
         if abs(self._base) >= LATEST:
             raise UnreadableRecording(
-                f"the first time stamp, {first}, lies beyond the year 2116; say `time: {{unit: ..., epoch: ...}}` "
+                f"the first time stamp, {first}, lies beyond the year 2116; set `time: {{unit: ..., epoch: ...}}` "
                 "in the system file"
             )
 

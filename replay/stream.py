@@ -19,7 +19,7 @@ class ClockJump:
 
 
 class Reorderer:
-    """Splits blocks where the clock jumps and drops what comes too late.
+    """Splits blocks where the clock jumps, and drops late samples.
 
     A sample belongs to the stream when it is at most `delay` older than the newest one and at most `pause` newer.
     Others wait: once `confirm` of them agree with each other, the clock has jumped (forward or backward);

@@ -80,7 +80,7 @@ def position(name: str, names: Sequence[str]) -> int | None:
     if count > 1:
         at = [str(i + 1) for i, other in enumerate(names) if other == name]
         raise UnreadableRecording(
-            f"{count} columns are called {name!r}; say which by its number: `column: {at[0]}` or {', '.join(at[1:])}"
+            f"{count} columns are called {name!r}; select one by its number: `column: {at[0]}` or {', '.join(at[1:])}"
         )
     if count:
         return names.index(name)
@@ -94,35 +94,45 @@ def find_columns(
 ) -> list[tuple[int, int]]:
     """(channel, column) of every channel that the table has.
 
-    Where the system file names no columns at all, they are called as its channels are.
-    Errors: UnreadableRecording when it has none, or when a name is nearly that of a column that nothing else uses.
+    If the system file names no columns at all, columns are matched to the names of its channels.
+    Errors: `UnreadableRecording` if none is found, or if a name resembles that of an unused column.
     """
-    wanted = [(i, (c.csv or c.column) if csv else (c.column or c.csv)) for i, c in enumerate(channels)]
-    named = [(place, name) for place, name in wanted if name]
-    if not named:  # tables that `sprung simulate` wrote are headed by the channels' own names
-        named = [(place, channel.name) for place, channel in enumerate(channels) if channel.name in names]
-    if not named:
-        key = "`csv: name`" if csv else "`column: name`"
-        raise UnreadableRecording(f"{path}: the system file names no columns; give its channels {key} to read tables")
     found: list[tuple[int, int]] = []
     lacking: list[tuple[int, str]] = []
-    for place, name in named:
+    for place, name in _wanted_columns(path, names, channels, csv=csv):
         try:
             at = position(name, list(names))
         except UnreadableRecording as error:
             raise UnreadableRecording(f"{path}: {error}") from None
         found.append((place, at)) if at is not None else lacking.append((place, name))
-    free = [name for i, name in enumerate(names) if i not in {at for _, at in found}]
-    near = {name: difflib.get_close_matches(name, free, n=3, cutoff=0.6) for _, name in lacking}
-    if not found or any(near.values()):
-        hints = "; ".join(
-            f"{name!r}{' (did you mean ' + some([repr(n) for n in close], ' or ') + '?)' if close else ''}"
-            for name, close in near.items()
-        )
+    used = {at for _, at in found}
+    unused = [name for i, name in enumerate(names) if i not in used]
+    similar = {name: difflib.get_close_matches(name, unused, n=3, cutoff=0.6) for _, name in lacking}
+    if not found or any(similar.values()):
+        hints = "; ".join(_hint(name, close) for name, close in similar.items())
         raise UnreadableRecording(f"{path}: columns not found: {hints}; its columns: {some(names)}")
     for place, name in lacking:
         account.note(f"no column {name!r} for {channels[place].name}")
-    return [(place, at) for place, at in found]
+    return found
+
+
+def _wanted_columns(
+    path: Path, names: Sequence[str], channels: Sequence[Channel], *, csv: bool
+) -> list[tuple[int, str]]:
+    """(channel, name of its column).  Errors: `UnreadableRecording` if the system file names no columns."""
+    wanted = [(i, (c.csv or c.column) if csv else (c.column or c.csv)) for i, c in enumerate(channels)]
+    named = [(place, name) for place, name in wanted if name]
+    if not named:  # tables of `sprung simulate` are headed by the names of the channels
+        named = [(place, channel.name) for place, channel in enumerate(channels) if channel.name in names]
+    if not named:
+        key = "`csv: name`" if csv else "`column: name`"
+        raise UnreadableRecording(f"{path}: the system file names no columns; give its channels {key} to read tables")
+    return named
+
+
+def _hint(name: str, similar: list[str]) -> str:
+    """A missing column with similar ones."""
+    return f"{name!r} (did you mean {some([repr(n) for n in similar], ' or ')}?)" if similar else repr(name)
 
 
 def no_time(path: Path, names: Sequence[str], time: TimeColumn) -> UnreadableRecording:
@@ -132,7 +142,7 @@ def no_time(path: Path, names: Sequence[str], time: TimeColumn) -> UnreadableRec
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         return UnreadableRecording(f"{path}: no time column {time.name!r}{hint}; its columns: {some(names)}")
     return UnreadableRecording(
-        f"{path}: no column of times is recognised; say `time: {{column: NAME, unit: s}}` or "
+        f"{path}: no column of times is recognised; set `time: {{column: NAME, unit: s}}` or "
         f"`time: {{rate: HZ}}` in the system file; its columns: {some(names)}"
     )
 
@@ -185,7 +195,7 @@ class Rows:
             account.relative = True
 
     def block(self, times: NDArray[Any] | Sequence[str] | None, values: FloatArray) -> SampleBlock:
-        """Rows (n, columns) with their times; None: the rate says when they were."""
+        """Rows (n, columns) with their times; None: by the sample rate."""
         if times is None:
             stamps: IntArray = np.rint((self._rows + np.arange(len(values))) * (SECOND / float(self.rate or 1))).astype(
                 np.int64
@@ -232,33 +242,43 @@ def column_blocks(
 
 
 def time_of(path: Path, column: Column, columns: Sequence[Column], time: TimeColumn) -> Column | EvenTimes:
-    """The times of a column: what the system file says, a time column of its length in its group or anywhere, else
-    its own clock."""
+    """The times of a column: by the system file, else a time column of its length, else its own clock.
+
+    Time columns of the column's own group come first.  Errors: `UnreadableRecording` if there are no times.
+    """
     if time.rate is not None:
         return EvenTimes(0, 1.0 / time.rate, True)
     if column.clock is not None and time.name is None:
         return column.clock
     names = [one.name for one in columns if one.length == column.length]
-    near = [name for name in names if name.startswith(column.group) and "/" not in name[len(column.group) :]]
-    chosen = None
-    if time.name is not None:
-        chosen = next((name for name in (column.group + time.name, time.name) if name in names), None)
-        if chosen is None and any(one.name == time.name for one in columns):
-            length = next(one.length for one in columns if one.name == time.name)
-            raise UnreadableRecording(
-                f"{path}: {column.name} has {column.length} values, its time {time.name} has {length}"
-            )
-    else:
-        for group in (near, names):
-            short = {name.rsplit("/", 1)[-1].rsplit(".", 1)[-1]: name for name in group}
-            chosen = short.get(time_name(list(short), time) or "")
-            if chosen:
-                break
-    if chosen is None:
-        if column.clock is not None:
-            return column.clock
-        raise no_time(path, [one.name for one in columns], time)
-    return next(one for one in columns if one.name == chosen)
+    chosen = _time_by_name(column, names, time) if time.name is not None else _time_by_kind(column, names, time)
+    if chosen is not None:
+        return next(one for one in columns if one.name == chosen)
+    other = next((one for one in columns if one.name == time.name), None)
+    if other is not None:
+        raise UnreadableRecording(
+            f"{path}: {column.name} has {column.length} values, its time {time.name} has {other.length}"
+        )
+    if column.clock is not None:
+        return column.clock
+    raise no_time(path, [one.name for one in columns], time)
+
+
+def _time_by_name(column: Column, names: list[str], time: TimeColumn) -> str | None:
+    """The time column that the system file names, of the column's group or of the whole file."""
+    assert time.name is not None
+    return next((name for name in (column.group + time.name, time.name) if name in names), None)
+
+
+def _time_by_kind(column: Column, names: list[str], time: TimeColumn) -> str | None:
+    """A time column that is recognised by its name, of the column's group or of the whole file."""
+    group = [name for name in names if name.startswith(column.group) and "/" not in name[len(column.group) :]]
+    for candidates in (group, names):
+        short = {name.rsplit("/", 1)[-1].rsplit(".", 1)[-1]: name for name in candidates}
+        chosen = short.get(time_name(list(short), time) or "")
+        if chosen:
+            return chosen
+    return None
 
 
 class _Series:

@@ -125,7 +125,7 @@ class Windower:
         self._stretch = None
 
     def _finish(self) -> list[Window]:
-        """Emit what the current grid still holds and forget it."""
+        """Emit the windows of the current grid and reset it."""
         out: list[Window] = []
         if self._origin is not None and any(len(block.time) for block in self._pending):
             last = max(int(block.time.max()) for block in self._pending if len(block.time)) - self._base
@@ -290,7 +290,7 @@ class _Batch:
         return None
 
     def _resampled(self, channel: int, rows: slice) -> tuple[Resampled, str | None]:
-        """One channel that does not lie on the grid, and what the user must know about it."""
+        """One channel that does not lie on the grid, and a remark for the user."""
         offset, value = self._samples_of(channel)
         near = slice(*np.searchsorted(offset, [rows.start - REACH - 1, rows.stop + REACH + 1]))
         grid = np.arange(rows.start, rows.stop, dtype=np.float64)

@@ -31,7 +31,7 @@ def write_recording(
     dbc: str | Path | None = None,
     vehicle: str | None = None,
 ) -> None:
-    """Write values (T, C), SI, sampled evenly from `start` (ns since the epoch); the suffix of the path says how.
+    """Write values (T, C), SI, sampled evenly from `start` (ns since the epoch), in the format of the path.
 
     Scale, offset, sign and unit of the addresses are undone, so that reading gives the same values again.  NaN is
     left out.  CAN formats need the database; signals are rounded to its steps and cut to its range.

@@ -13,7 +13,7 @@ from sprung.model.ambient.periodogram import Spectra
 from sprung.model.ambient.sensing import Sensing, sensing
 from sprung.model.ambient.speed import Track
 from sprung.model.ambient.transient import USUAL, TransientFit, TransientWindow
-from sprung.model.ambient.window import LOAD_STD, Told, WindowFit
+from sprung.model.ambient.window import LOAD_STD, AmbientFit, WindowFit
 from sprung.model.identifier import PRIOR_STD, StageTimes, UnusableWindow
 from sprung.model.schema import Body
 from sprung.model.signals import BoolArray, Estimate, FloatArray
@@ -58,7 +58,7 @@ class AmbientIdentifier:
     def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
         """One `Estimate` per window (B, T, C), NaN columns for absent sensors; see `model.identifier.Identifies`.
 
-        states: never simulated, for nobody knows what moved the system.  Errors: `UnusableWindow`.
+        states: ignored, since the excitation is unknown.  Errors: `UnusableWindow`.
         """
         windows = self._checked(windows)
         begin = time.perf_counter()
@@ -66,8 +66,8 @@ class AmbientIdentifier:
         self.times = StageTimes(0.0, time.perf_counter() - begin)
         return found
 
-    def told(self, values: FloatArray, start: FloatArray | None = None) -> Told | None:
-        """What one window (T, C) says in full; None if it is too quiet, too short or too slow."""
+    def fit(self, values: FloatArray, start: FloatArray | None = None) -> AmbientFit | None:
+        """The fit of one window (T, C); None if it is too quiet, too short or too slow."""
         inputs = len(self.system.inputs)
         sensors = np.flatnonzero(np.isfinite(values[:, inputs:]).all(axis=0))
         if len(sensors) == 0:
@@ -80,13 +80,13 @@ class AmbientIdentifier:
         excitation = self.assumption.excitation(values[:, :inputs], found, sensed)
         if excitation is None:
             return None
-        return self.window.told(self.window.fit(found, sensed, excitation, start), found, sensed)
+        return self.window.judged(self.window.fit(found, sensed, excitation, start), found, sensed)
 
     def _estimate(self, values: FloatArray, start: FloatArray | None) -> Estimate:
-        told = self.told(values, start)
+        fit = self.fit(values, start)
         present = np.asarray(np.isfinite(values[:, len(self.system.inputs) :]).all(axis=0))
         P = len(self.system.parameters)
-        return _silent(P, len(present)) if told is None else as_estimate(told, P, present)
+        return _silent(P, len(present)) if fit is None else as_estimate(fit, P, present)
 
     def _checked(self, windows: FloatArray) -> FloatArray:
         return checked(self.system, windows)
@@ -110,7 +110,7 @@ class OutputOnlyIdentifier:
     def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
         """One `Estimate` per window (B, T, C), NaN columns for absent sensors; see `model.identifier.Identifies`.
 
-        states: never simulated, for nobody knows what moved the system.  Errors: `UnusableWindow`.
+        states: ignored, since the excitation is unknown.  Errors: `UnusableWindow`.
         """
         windows = checked(self.system, windows)
         begin = time.perf_counter()
@@ -121,16 +121,16 @@ class OutputOnlyIdentifier:
     def _estimate(self, values: FloatArray, start: FloatArray | None) -> Estimate:
         present = np.asarray(np.isfinite(values).all(axis=0))
         sensors, P = np.flatnonzero(present), len(self.system.parameters)
-        told = self.window.told(values[:, sensors], sensors, start) if len(sensors) else None
-        if told is None:
+        fit = self.window.fit(values[:, sensors], sensors, start) if len(sensors) else None
+        if fit is None:
             return _silent(P, len(present))
-        if not told.adequate:
-            coloured = self.coloured.told(values, start)
+        if not fit.adequate:
+            coloured = self.coloured.fit(values, start)
             if coloured is not None:
                 seen = as_estimate(coloured, P, present)
                 if seen.adequate and seen.identifiable.any():
                     return seen
-        return _of_transient(told, P, present)
+        return _of_transient(fit, P, present)
 
 
 def checked(system: System, windows: FloatArray) -> FloatArray:
@@ -144,44 +144,44 @@ def checked(system: System, windows: FloatArray) -> FloatArray:
     return windows
 
 
-def _of_transient(told: TransientFit, P: int, present: BoolArray) -> Estimate:
+def _of_transient(fit: TransientFit, P: int, present: BoolArray) -> Estimate:
     """The first P unknowns are the system's parameters."""
-    covariance = told.covariance[:P, :P]
+    covariance = fit.covariance[:P, :P]
     identifiable = np.sqrt(np.diag(covariance)) < IDENTIFIABLE_STD
-    share = told.noise_share
+    share = fit.noise_share
     per_sensor = np.full(len(present), np.nan)
     per_sensor[present] = share
     return Estimate(
-        log_ratio=np.where(identifiable, told.fitted.x[:P], 0.0),
+        log_ratio=np.where(identifiable, fit.fitted.x[:P], 0.0),
         covariance=np.where(np.outer(identifiable, identifiable), covariance, np.eye(P) * PRIOR_STD**2),
         identifiable=identifiable,
         nrmse=float(np.sqrt(np.mean(share**2))),
         per_sensor=per_sensor,
-        chi_square=max(1.0, told.misfit / USUAL) ** 2,
-        adequate=told.adequate,
-        converged=told.fitted.converged,
-        iterations=told.fitted.iterations,
+        chi_square=max(1.0, fit.misfit / USUAL) ** 2,
+        adequate=fit.adequate,
+        converged=fit.fitted.converged,
+        iterations=fit.fitted.iterations,
         informative=bool(identifiable.any()),
         running=not identifiable.any(),
     )
 
 
-def as_estimate(told: Told, P: int, present: BoolArray) -> Estimate:
+def as_estimate(fit: AmbientFit, P: int, present: BoolArray) -> Estimate:
     """The first P unknowns are the system's parameters."""
-    fitted = told.fitted
-    # What the model cannot follow is treated as more noise, so that intervals stay honest.
-    covariance = fitted.covariance[:P, :P] * max(1.0, told.chi_square)
+    fitted = fit.fitted
+    # misfit counts as additional noise, which keeps the intervals valid
+    covariance = fitted.covariance[:P, :P] * max(1.0, fit.chi_square)
     identifiable = np.sqrt(np.diag(covariance)) < IDENTIFIABLE_STD
-    fits = told.chi_square < 1 + max(FIT_SIGMAS * told.chi_std, FIT_EXCESS)
+    fits = fit.chi_square < 1 + max(FIT_SIGMAS * fit.chi_std, FIT_EXCESS)
     per_sensor = np.full(len(present), np.nan)
-    per_sensor[present] = told.per_sensor
+    per_sensor[present] = fit.per_sensor
     return Estimate(
         log_ratio=np.where(identifiable, fitted.x[:P], 0.0),
         covariance=np.where(np.outer(identifiable, identifiable), covariance, np.eye(P) * PRIOR_STD**2),
         identifiable=identifiable,
-        nrmse=float(np.sqrt(np.mean(told.per_sensor**2))),
+        nrmse=float(np.sqrt(np.mean(fit.per_sensor**2))),
         per_sensor=per_sensor,
-        chi_square=told.chi_square,
+        chi_square=fit.chi_square,
         adequate=bool(fits and fitted.converged),
         converged=fitted.converged,
         iterations=fitted.iterations,

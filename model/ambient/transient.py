@@ -47,7 +47,7 @@ USUAL = 2.5  # standard deviations that the worst part of a good fit leaves its 
 
 @dataclass(frozen=True, slots=True)
 class TransientFit:
-    """What one window told."""
+    """Fit of one window."""
 
     fitted: Fitted  # x: log-ratios, log-levels of the forces' power, logarithm of the noise power over the declared
     frequency: FloatArray  # of the compared bins, Hz, shape (F,)
@@ -160,12 +160,12 @@ class TransientWindow:
         frequency = np.fft.rfftfreq(samples, 1 / rate)
         return np.asarray(frequency[(frequency >= low) & (frequency <= high)])
 
-    def told(
+    def fit(
         self, values: FloatArray, sensors: np.ndarray, start: FloatArray | None = None, known: FloatArray | None = None
     ) -> TransientFit | None:
-        """What a window (T, S) of the sensors at these indices says; None where it is too short or too quiet.
+        """The fit of a window (T, S) of the sensors at these indices; None if it is too short or too quiet.
 
-        start: log-ratios to begin from.  known: log-ratios that are kept; only levels are estimated.
+        start: initial log-ratios (P,).  known: fixed log-ratios (P,); only levels are estimated.
         """
         frequency = self.bins(len(values))
         if len(frequency) < max(FEWEST, len(self.system.parameters) + 2):

@@ -30,8 +30,8 @@ LOAD_STD = 0.3  # of a body's mass that varies, where the file states no range
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """What one window told about P unknowns and the excitation's Q free numbers."""
+class AmbientFit:
+    """Fit of one window: P unknowns, and Q free values of the excitation."""
 
     fitted: Fitted
     spectra: Spectra
@@ -127,8 +127,8 @@ class WindowFit:
             x = fitted.x
         return fitted
 
-    def told(self, fitted: Fitted, found: Spectra, sensed: Sensing) -> Told:
-        """How well the fit explains the window."""
+    def judged(self, fitted: Fitted, found: Spectra, sensed: Sensing) -> AmbientFit:
+        """A fit with its goodness of fit."""
         whitened = fitted.at.whitened
         size, spares = whitened.shape[1], len(sensed.spare)
         # Complex Wishart of m degrees of freedom: E |W - 1|^2 = R^2 / m.
@@ -137,7 +137,7 @@ class WindowFit:
         numbers = size**2 + spares
         statistic = (fits + apart.sum(axis=1)) / numbers
         variance = 2 / numbers + 4 / (size * found.weight)
-        return Told(
+        return AmbientFit(
             fitted=fitted,
             spectra=found,
             chi_square=float(statistic.mean()),

@@ -61,10 +61,10 @@ def diagnose(
     >>> report.verdict, report.findings[0].location, report.findings[0].effect
     ('missing_physics', 'damper', 'coulomb_friction')
     """
-    tell, options = progress or (lambda share, text: None), options or Options()
+    progress, options = progress or (lambda share, text: None), options or Options()
     channels = record.values[:, : len(system.channels)]
     if is_component_test(system, channels, options.rules):
-        return diagnose_components(system, record, options, tell)
+        return diagnose_components(system, record, options, progress)
     if system.signals:
         system = replace(system, catalogue=(*system.catalogue, *following_laws(system, record)))
         record = RecordedPart(record.sample_rate, channels, record.lost)
@@ -73,18 +73,18 @@ def diagnose(
         prepared = prepare(system, system.undistorted(record.values), record.sample_rate, whole)
         decay = None if system.on_track else decay_stretch(prepared.signals, system.sensor_noise, options.rules)
         if decay is None:
-            return diagnose_unforced(system, prepared, record, options, tell)
+            return diagnose_unforced(system, prepared, record, options, progress)
         record = RecordedPart(record.sample_rate, record.values[decay], record.lost)
-    outcome = investigate(system, record, options, tell)
+    outcome = investigate(system, record, options, progress)
     if not system.file.inputs and outcome.judgement.rejected is not None:
-        outcome = _along_what_was_seen(system, record, options, tell) or outcome
-    tell(0.95, "report")
+        outcome = _along_what_was_seen(system, record, options, progress) or outcome
+    progress(0.95, "report")
     report = compose(outcome, record)
-    tell(1.0, "done")
+    progress(1.0, "done")
     return report
 
 
-def _along_what_was_seen(system: System, record: Recorded, options: Options, tell: Progress) -> Outcome | None:
+def _along_what_was_seen(system: System, record: Recorded, options: Options, progress: Progress) -> Outcome | None:
     """A free decay whose phase no simulation keeps, laws acting along the motion that the sensors saw; None: nor so.
 
     A law that shifts the frequency makes a linear start diverge within a few periods.  With forces that nobody measured
@@ -94,5 +94,5 @@ def _along_what_was_seen(system: System, record: Recorded, options: Options, tel
     pushed = replace(system, file=system.file.model_copy(update={"inputs": forces}))
     none = np.zeros((len(record.values), len(forces)))
     values = np.column_stack([none, record.values])
-    outcome = investigate(pushed, RecordedPart(record.sample_rate, values, record.lost), options, tell)
+    outcome = investigate(pushed, RecordedPart(record.sample_rate, values, record.lost), options, progress)
     return None if outcome.judgement.rejected is not None else outcome

@@ -1,10 +1,10 @@
-"""Every number that decides what a diagnosis says, by stage, with its reason.
+"""Every number that decides the result of a diagnosis, by stage, with its reason.
 
 A number is here when another value could change a verdict, a place or a name.  Tolerances of the numerics, which only
 have to be small, stay beside the code that iterates.  A reason begins with "derived" where the number follows from
 statistics or the sampling, and with "chosen" where it was found on simulated vehicles; `sprung bench sensitivity`
-varies every one over its range and prints what changes.  What it found last stands in `varied.json` beside this file,
-and `reason` says both.
+varies every one over its range and prints what changes.  Its latest results are in `varied.json` beside this file;
+`reason` quotes both.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ def rule(value: Any, reason: str, low: Any, high: Any) -> Any:
 
 
 def reason(stage: str, number: Field[Any]) -> str:
-    """Why a number is what it is, and what the sensitivity bench found where it is another."""
+    """Reason for a number's value, and the result of the sensitivity bench for other values."""
     found = _varied()["numbers"].get(f"{stage}.{number.name}")
     low, high = number.metadata["range"]
     if found is None or found["varied"] != [number.default, low, high]:
         return f"{number.metadata['reason']}; not varied as it is now"
     where = "; ".join(found.get("on", [f"{found['recordings']} of {_varied()['set']}"]))
-    told = f"insensitive from {low:g} to {high:g}"
+    effect = f"insensitive from {low:g} to {high:g}"
     if found["changes"]:
-        told = f"changes {'; '.join(found['changes'])}"
-    return f"{number.metadata['reason']}; on {where} {told}"
+        effect = f"changes {'; '.join(found['changes'])}"
+    return f"{number.metadata['reason']}; on {where} {effect}"
 
 
 @cache
@@ -45,7 +45,7 @@ def _varied() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class RecordRules:
-    """What can be used of a recording."""
+    """Requirements on recordings."""
 
     minimum_samples: int = rule(200, "derived: two periods of the slowest mode of a vehicle at 100 Hz", 100, 400)
     fitted: float = rule(0.7, "of the recording, from its start; chosen: the rest judges what was fitted", 0.6, 0.8)
@@ -67,7 +67,7 @@ class RecordRules:
 
 @dataclass(frozen=True)
 class FitRules:
-    """What is known before a recording."""
+    """Priors, and the budget of work."""
 
     prior: float = rule(
         1.0, "deviation of a log-ratio to nominal; derived: a factor e, no vehicle is further", 0.7, 2.0
@@ -82,7 +82,7 @@ class FitRules:
 
 @dataclass(frozen=True)
 class ScreeningRules:
-    """Which trials are scored."""
+    """Range of the scored trials."""
 
     slowest: float = rule(0.5, "Hz, of fundamentals; derived: rail joints at walking pace", 0.3, 1.0)
     fastest: float = rule(21.0, "Hz, of fundamentals; derived: wheels of 0.92 m at 60 m/s", 15.0, 30.0)
@@ -101,7 +101,7 @@ class ScreeningRules:
 
 @dataclass(frozen=True)
 class EvidenceRules:
-    """What a better fit is worth."""
+    """Evidence of a better fit."""
 
     blocks: int = rule(14, "per sensor; chosen", 8, 24)
     first_block: int = rule(24, "bins; derived: the level of a block is then known to 20 %", 16, 48)
@@ -115,7 +115,7 @@ class EvidenceRules:
 
 @dataclass(frozen=True)
 class SelectionRules:
-    """Which candidates are fitted, and which of them leads."""
+    """Choice of the candidates that are fitted, and of the leading one."""
 
     close: float = rule(0.25, "of the best score, from which a candidate at its place is fitted; chosen", 0.12, 0.5)
     close_elsewhere: float = rule(0.6, "the same at other places; chosen", 0.4, 0.8)
@@ -126,7 +126,7 @@ class SelectionRules:
         1.0, "log-ratio to nominal of a parameter, from which a part is tried from nominal, too; chosen", 0.5, 1.5
     )
     most: int = rule(9, "candidates that are fitted; chosen", 6, 14)
-    gross: float = rule(0.3, "error over the signal, from which scores tell the place alone; chosen", 0.2, 0.5)
+    gross: float = rule(0.3, "error over the signal, from which scores only indicate the place; chosen", 0.2, 0.5)
     most_gross: int = rule(14, "candidates that are fitted then; chosen: all laws of an element", 9, 20)
     wider: int = rule(2, "of the best laws beside another, that are fitted in their wider forms; chosen", 1, 3)
     unnamed: int = rule(2, "unnamed forces among them at one place; chosen", 1, 3)
@@ -144,7 +144,7 @@ class SelectionRules:
 
 @dataclass(frozen=True)
 class PlausibleRules:
-    """What is not believed, however well it fits."""
+    """Limits of plausible values."""
 
     knees: float = rule(0.5, "of the rate passed within a sample; derived: both knees lie within it", 0.3, 0.8)
     corner: float = rule(
@@ -179,7 +179,7 @@ class PlausibleRules:
 
 @dataclass(frozen=True)
 class AcceptanceRules:
-    """When a further finding counts, and how faults of input channels are compensated."""
+    """Acceptance of further findings, and compensation of input faults."""
 
     alpha: float = rule(1e-3, "chance of a false finding before the held-out check; chosen: one recording", 1e-4, 1e-2)
     findings: int = rule(6, "that are sought at most; chosen: five, and one to see that there is none", 5, 8)
@@ -199,7 +199,7 @@ class AcceptanceRules:
 
 @dataclass(frozen=True)
 class FormulaRules:
-    """When an unnamed force is told by a formula."""
+    """When an unnamed force is expressed by a formula."""
 
     partners: int = rule(40, "single shapes, and pairs, that are scored at finer values; chosen", 20, 80)
     rounds: int = rule(2, "of scores along the motion of the best so far; chosen", 1, 3)
@@ -216,34 +216,36 @@ class FormulaRules:
     )
     chance: float = rule(25.0, "score beside a formula that is chance; derived: some 700 trials", 20.0, 40.0)
     missing: float = rule(0.05, "of its force, that may be missing; chosen: what counts as equivalent", 0.02, 0.1)
-    rival: float = rule(10.0, "evidence behind, at which another formula says as much; chosen: odds of 150", 5.0, 20.0)
+    rival: float = rule(10.0, "evidence behind, at which another formula is equivalent; chosen: odds of 150", 5.0, 20.0)
     agree: float = rule(0.1, "of its force, by which rivals differ; chosen: a false one is 0.15 off", 0.05, 0.15)
-    says: float = rule(0.97, "of the unnamed force's gain, that a formula must explain; chosen", 0.9, 0.995)
+    explains: float = rule(0.97, "of the unnamed force's gain, that a formula must explain; chosen", 0.9, 0.995)
 
 
 @dataclass(frozen=True)
 class NoiseRules:
-    """When the noise of a single channel is a fault."""
+    """Noise of single channels as a fault."""
 
     least: float = rule(1.12, "ratio to its peers; chosen: less is no maintenance", 1.06, 1.25)
     sigmas: float = rule(6.0, "by which the ratio leaves its peers'; derived: chance and modelling errors", 4.0, 8.0)
     inaccuracy: float = rule(0.05, "of the power that findings changed, which they may have wrong; chosen", 0.02, 0.1)
     upper: float = rule(0.38, "of the sample rate; derived: above, anti-alias filters cut", 0.34, 0.42)
     white: float = rule(0.5, "of the excess, that goes on above the band; derived: noise does, physics ends", 0.3, 0.7)
-    bins: int = rule(20, "above the band, that tell noise; derived: their level is known to 20 %", 10, 40)
+    bins: int = rule(20, "above the band, for the noise level; derived: their level is known to 20 %", 10, 40)
     blocks: int = rule(24, "of the band, whose median is a sensor's level; chosen: physics fills few", 12, 48)
-    own: float = rule(0.01, "of a bin's variance, from which it tells a sensor's own noise; chosen", 0.003, 0.03)
+    own: float = rule(0.01, "of a bin's variance, from which it informs on a sensor's own noise; chosen", 0.003, 0.03)
     fall: float = rule(0.01, "of a force's noise power, that one round may leave; chosen: steps of ten", 0.003, 0.1)
     misdeclared: float = rule(
         10.0, "times a declared noise, that a displacement may show; chosen: a slip of ten", 5.0, 20.0
     )
-    displacement: float = rule(0.5, "of the bins that tell a support's displacement; derived: the fast half", 0.3, 0.7)
-    velocity: float = rule(0.15, "of them its velocity; derived: the slow ones alone", 0.08, 0.3)
+    displacement: float = rule(
+        0.5, "of the bins, informative on a support's displacement; derived: the fast half", 0.3, 0.7
+    )
+    velocity: float = rule(0.15, "the same on its velocity; derived: the slow ones alone", 0.08, 0.3)
 
 
 @dataclass(frozen=True)
 class SetupRules:
-    """Deciding constants of the search for wrong set-ups."""
+    """Search for set-up faults."""
 
     misfit: float = rule(4e-3, "misfit of a sensor; chosen: vehicles fitted well have 1e-3", 2e-3, 8e-3)
     promising: float = rule(0.85, "of the misfit that one may leave by spectra, to be fitted; chosen", 0.7, 0.95)
@@ -269,7 +271,7 @@ class SetupRules:
     part_steps: int = rule(8, "of the fit of a missing part; chosen: it then stands within 1 %", 5, 12)
     bins: int = rule(400, "that rank what may be wrong with the file; derived: a misfit known to 5 %", 200, 2000)
     asked: float = rule(0.2, "of another body that least squares must ask for; derived: a right one is 1", 0.1, 0.4)
-    above: float = rule(1.3, "times the fastest mode, from where masses alone are told; chosen", 1.15, 1.6)
+    above: float = rule(1.3, "times the fastest mode, above which only masses matter; chosen", 1.15, 1.6)
     by_mass: float = rule(0.5, "of the misfit there, that an explanation may leave; chosen", 0.35, 0.65)
     soonest: float = rule(0.75, "samples of a delay there; derived: rounding a clock makes half of one", 0.5, 1.5)
     gravity: float = rule(0.1, "of a log-ratio, within which it is standard gravity; chosen", 0.05, 0.2)
@@ -277,7 +279,7 @@ class SetupRules:
 
 @dataclass(frozen=True)
 class VerdictRules:
-    """What the held-out errors come to."""
+    """Verdict from held-out errors."""
 
     clear: float = rule(1.5, "error over the floor, pooled, up to which nothing is left; chosen", 1.25, 2.0)
     clear_sensor: float = rule(2.0, "the same of a single sensor; chosen", 1.6, 3.0)
@@ -295,11 +297,11 @@ class VerdictRules:
 
 @dataclass(frozen=True)
 class ReportRules:
-    """What a report says beside the verdict."""
+    """Contents of a report beside the verdict."""
 
     naming_margin: float = rule(6.0, "evidence over look-alikes to be named alone; derived: odds of 20 to 1", 3.0, 10.0)
     changed: float = rule(0.25, "from nominal, at which a parameter is listed as changed; chosen", 0.15, 0.4)
-    sure: float = rule(5.0, "deviations of a change that is told; derived: no chance in any of 24 values", 4.0, 6.0)
+    sure: float = rule(5.0, "deviations of a change that is reported; derived: no chance in any of 24 values", 4.0, 6.0)
     no_longer: float = rule(10.0, "times, by which what stood for a finding was read too high; chosen", 5.0, 20.0)
     alike: float = rule(0.5, "correlation from which a sign or scale is a likely reason; chosen", 0.3, 0.7)
     scale: float = rule(3.0, "ratio of sizes; chosen: no parameter explains it", 2.0, 5.0)
@@ -310,14 +312,14 @@ class ReportRules:
 
 @dataclass(frozen=True)
 class ComponentRules:
-    """Deciding constants of a component's diagnosis."""
+    """Diagnosis of component tests."""
 
     search: int = rule(4000, "samples that trial shapes are compared on; chosen", 2000, 8000)
     fit: int = rule(16000, "samples of the final fit; chosen: few of them are independent", 8000, 32000)
     most: int = rule(3, "laws; chosen: real rigs have more imperfections than a record can name", 2, 4)
     per_signal: int = rule(2, "more for every signal; derived: spring and damper may follow it", 1, 3)
     alpha: float = rule(1e-3, "chance of a false finding per recording; chosen", 1e-4, 1e-2)
-    told: float = rule(2.0, "deviations that a law's force must exceed; derived: 5 % of chance", 1.0, 3.0)
+    significant: float = rule(2.0, "deviations that a law's force must exceed; derived: 5 % of chance", 1.0, 3.0)
     least_share: float = rule(0.2, "of the power still left that a further law must remove; chosen", 0.1, 0.4)
     minor: float = rule(0.003, "of the error's power, that a further law must remove; chosen", 1e-3, 0.01)
     naming_margin: float = rule(6.0, "evidence over look-alikes; derived: odds of 20 to 1", 3.0, 10.0)
@@ -361,7 +363,7 @@ class ComponentRules:
     rest: float = rule(0.25, "s that a standstill lasts; chosen: a turning point is shorter", 0.15, 0.5)
     stands_out: float = rule(3.0, "times the noise's power, that motion has; derived: 5 % of chance", 2.0, 5.0)
     turned: float = rule(3.0, "times what speaks for its sign, that speaks against it; chosen", 2.0, 5.0)
-    preload: float = rule(5.0, "deviations of a preload that is told; derived: one in a million", 3.0, 8.0)
+    preload: float = rule(5.0, "deviations of a preload that is reported; derived: one in a million", 3.0, 8.0)
     beside: int = rule(4, "trials that are refined beside the close laws; chosen", 2, 8)
     stands_clear: float = rule(
         300.0, "times the noise's power, of an acceleration that is integrated; chosen", 100.0, 1000.0
@@ -376,22 +378,22 @@ class ComponentRules:
     stretches: int = rule(20, "of the fitted part, with errors of their own; derived: a covariance needs some", 10, 40)
     formula_reach: float = rule(20.0, "times the usual size of a length or rate, either way; chosen", 10.0, 40.0)
     formula_partners: int = rule(3, "shapes of a formula that others are tried beside; chosen", 2, 5)
-    formula_told: float = rule(5.0, "deviations of an amplitude; derived: one in a million", 3.0, 8.0)
+    formula_significant: float = rule(5.0, "deviations of an amplitude; derived: one in a million", 3.0, 8.0)
     formula_pair: float = rule(0.5, "of the held-out power of one shape, that two may leave; chosen", 0.3, 0.7)
 
 
 @dataclass(frozen=True)
 class AmbientRules:
-    """Deciding constants of a diagnosis without any measured input."""
+    """Diagnosis without measured inputs."""
 
-    alpha: float = rule(1e-4, "chance of windows that only scatter being told apart; chosen", 1e-5, 1e-3)
+    alpha: float = rule(1e-4, "chance of a false variation over windows; chosen", 1e-5, 1e-3)
     varies: float = rule(0.02, "of a parameter's logarithm; derived: a hundredth of a frequency", 0.01, 0.04)
     spread: float = rule(4.0, "deviations of single windows by which most of them must differ; chosen", 2.0, 8.0)
     sure: float = rule(0.03, "deviation of a window that stands for the lowest or highest value; chosen", 0.015, 0.06)
-    told: float = rule(0.3, "deviation of a log-ratio above which a window tells nothing of it; chosen", 0.15, 0.5)
-    coarse: float = rule(0.15, "of the power that chance puts elsewhere: little is told; chosen", 0.08, 0.3)
+    undetermined: float = rule(0.3, "deviation of a log-ratio from which a window is uninformative; chosen", 0.15, 0.5)
+    coarse: float = rule(0.15, "of the power elsewhere by random errors, from which advice is given; chosen", 0.08, 0.3)
     rejected: float = rule(0.35, "of the power at other frequencies: another structure; chosen", 0.2, 0.6)
-    blocks: int = rule(12, "of a recording, whose levels tell a free decay; chosen", 8, 20)
+    blocks: int = rule(12, "of a recording, whose levels indicate a free decay; chosen", 8, 20)
     rise: float = rule(1.15, "of a level over the one before, up to which it still falls; chosen", 1.05, 1.3)
     fallen: float = rule(0.5, "of the first level that the last may have; chosen", 0.3, 0.7)
     least: float = rule(0.6, "of the recording that a decay must cover; chosen", 0.4, 0.8)
@@ -399,9 +401,9 @@ class AmbientRules:
     loud: float = rule(3.0, "level over the noise's, down to which a decay is followed; chosen", 2.0, 5.0)
     beyond: float = rule(1.2, "of the decay's length that is kept; chosen", 1.0, 1.5)
     over_noise: float = rule(2.0, "times the noise; derived: below, a falling level is the noise's", 1.5, 3.0)
-    windows: int = rule(60, "of a structure that are looked at; chosen: more say the same", 30, 120)
+    windows: int = rule(60, "of a structure that are evaluated; chosen: more add little", 30, 120)
     windows_track: int = rule(8, "of a vehicle on an unmeasured track; chosen", 5, 16)
-    independent: int = rule(3, "windows that tell scatter; derived: two have one difference", 3, 5)
+    independent: int = rule(3, "windows for a scatter; derived: two have one difference", 3, 5)
     parts: int = rule(40, "of the band, in which powers are compared; chosen", 25, 60)
 
 

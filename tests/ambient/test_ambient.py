@@ -146,15 +146,15 @@ def test_periodograms_of_a_long_record_have_the_modelled_spectrum(vehicle: Syste
 def test_a_minute_of_accelerometers_tells_every_parameter_speed_and_load(vehicle: System) -> None:
     rng = np.random.default_rng(5)
     ride = draw_ride(rng)
-    told = AmbientIdentifier(vehicle).told(record(rng, ride, 60.0))
-    assert told is not None
-    error = told.log_ratio - np.append(ride.log_ratio, ride.load)
-    std = np.sqrt(np.diag(told.covariance))
+    fit = AmbientIdentifier(vehicle).fit(record(rng, ride, 60.0))
+    assert fit is not None
+    error = fit.log_ratio - np.append(ride.log_ratio, ride.load)
+    std = np.sqrt(np.diag(fit.covariance))
     assert np.abs(error / std).max() < 4.0
     assert np.sqrt(np.mean(error[:8] ** 2)) < 0.04
-    speed, speed_std = told.speed
+    speed, speed_std = fit.speed
     assert abs(speed - ride.speed) < 4 * speed_std < 0.1
-    assert told.chi_square == pytest.approx(1.0, abs=6 * told.chi_std)
+    assert fit.chi_square == pytest.approx(1.0, abs=6 * fit.chi_std)
 
 
 def test_a_vehicle_that_runs_backwards_is_recognised(vehicle: System) -> None:
@@ -162,10 +162,10 @@ def test_a_vehicle_that_runs_backwards_is_recognised(vehicle: System) -> None:
     ride = draw_ride(rng)
     values = record(rng, ride, 60.0)
     turned = parse_system(_turned(ACCELEROMETERS.read_text()) + f"\nspeed: {ride.speed:.4f}\n")
-    told = AmbientIdentifier(turned).told(values)
-    assert told is not None
-    assert told.speed[0] == pytest.approx(-ride.speed, rel=1e-3)
-    assert np.abs(told.log_ratio[:8] - ride.log_ratio[:8]).max() < 0.1
+    fit = AmbientIdentifier(turned).fit(values)
+    assert fit is not None
+    assert fit.speed[0] == pytest.approx(-ride.speed, rel=1e-3)
+    assert np.abs(fit.log_ratio[:8] - ride.log_ratio[:8]).max() < 0.1
 
 
 def _turned(text: str) -> str:
@@ -218,13 +218,13 @@ def test_a_measured_speed_is_used_and_a_missing_one_estimated() -> None:
     identifier = AmbientIdentifier(system)
     stds = []
     for speed in (ride.speed, np.nan):
-        told = identifier.told(np.column_stack([np.full(3000, speed), values]))
-        assert told is not None
-        assert told.speed[0] == pytest.approx(ride.speed, rel=3e-3)
-        stds.append(told.speed[1])
+        fit = identifier.fit(np.column_stack([np.full(3000, speed), values]))
+        assert fit is not None
+        assert fit.speed[0] == pytest.approx(ride.speed, rel=3e-3)
+        stds.append(fit.speed[1])
     assert stds[0] <= stds[1]
     crawling = np.column_stack([np.full(3000, 3.0), values])
-    assert identifier.told(crawling) is None
+    assert identifier.fit(crawling) is None
 
 
 def test_windows_of_another_shape_and_values_that_are_no_numbers_are_refused(vehicle: System) -> None:
@@ -249,10 +249,10 @@ def test_intervals_hold_what_they_promise(vehicle: System) -> None:
     for seed in range(24):
         rng = np.random.default_rng([10, seed])
         ride: DrawnRide = draw_ride(rng)
-        told = AmbientIdentifier(vehicle).told(record(rng, ride, 60.0))
-        assert told is not None
-        error = told.log_ratio - np.append(ride.log_ratio, ride.load)
-        inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(told.covariance)))
+        fit = AmbientIdentifier(vehicle).fit(record(rng, ride, 60.0))
+        assert fit is not None
+        error = fit.log_ratio - np.append(ride.log_ratio, ride.load)
+        inside.append(np.abs(error) < 1.96 * np.sqrt(np.diag(fit.covariance)))
     assert 0.91 < np.mean(inside) < 0.985
 
 
@@ -301,15 +301,15 @@ def test_a_free_decay_is_identified_as_one() -> None:
 
 def test_identifiability_without_inputs_is_what_a_window_then_tells() -> None:
     system = parse_system(TOWER)
-    told = identifiability(system)
+    fit = identifiability(system)
     (seen,) = load_identifier(system).identify(shaken_tower(np.random.default_rng(13), 120.0, 50.0)[None, :6000])
-    assert np.sqrt(np.diag(seen.covariance))[:2] == pytest.approx(told[:2], rel=0.6)
-    assert (told[:2] < 0.03).all()
+    assert np.sqrt(np.diag(seen.covariance))[:2] == pytest.approx(fit[:2], rel=0.6)
+    assert (fit[:2] < 0.03).all()
 
 
 def test_identifiability_of_a_vehicle_on_a_track_is_what_a_minute_then_tells(vehicle: System) -> None:
-    told = identifiability(vehicle)
-    assert told[:8].max() < 0.03 and told[12:20].max() < 0.1
+    fit = identifiability(vehicle)
+    assert fit[:8].max() < 0.03 and fit[12:20].max() < 0.1
     with pytest.raises(SystemFileError, match=r"window: 1 s is too short .* a minute \(6000\)"):
         parse_system(ACCELEROMETERS.read_text().replace("window: 6000", "window: 100"))
 

@@ -41,7 +41,7 @@ def test_what_a_recording_does_not_tell_apart_is_called_a_family() -> None:
     (finding,) = report.findings
     assert finding.family is not None
     assert set(finding.family.split(" or ")) == {"coulomb_friction", "damper_blowoff"}
-    assert "does not tell apart" in finding.sentence
+    assert "cannot distinguish" in finding.sentence
     assert finding.advice is not None and "would tell them apart" in finding.advice
 
 

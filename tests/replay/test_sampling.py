@@ -126,7 +126,7 @@ def test_times_in_another_unit_than_assumed_are_refused_with_the_likely_one(tmp_
     seconds = np.arange(500) / 100.0
     for factor, unit in ((1e3, "ms"), (1e6, "us")):
         write_table(tmp_path / "a.csv", seconds * factor, [np.sin(seconds), np.cos(seconds)])
-        with pytest.raises(UnreadableRecording, match=rf"if its times are in {unit}, say `time: {{unit: {unit}}}`"):
+        with pytest.raises(UnreadableRecording, match=rf"if its times are in {unit}, set `time: {{unit: {unit}}}`"):
             load_record(tmp_path / "a.csv", CSV_CHANNELS, 100.0)
 
 

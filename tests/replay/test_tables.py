@@ -123,7 +123,7 @@ def test_a_first_column_that_does_not_rise_is_no_time(tmp_path: Path) -> None:
 def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table(before="time,x,x\n"))
     with pytest.raises(
-        UnreadableRecording, match=r"2 columns are called 'x'; say which by its number: `column: 2` or 3"
+        UnreadableRecording, match=r"2 columns are called 'x'; select one by its number: `column: 2` or 3"
     ):
         read(tmp_path / "a.csv")
     check(tmp_path / "a.csv", (Channel("x", "m", 1.0, column="2"), Channel("F", "N", 1.0, column="3")))
@@ -132,7 +132,7 @@ def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path: Path) -> Non
 def test_without_a_time_column_the_rate_must_be_said(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x,F\n" + "".join(f"{x:.6f},{f:.4f}\n" for x, f in VALUES))
     with pytest.raises(
-        UnreadableRecording, match=r"no column of times is recognised; say `time: \{column: NAME, unit: s"
+        UnreadableRecording, match=r"no column of times is recognised; set `time: \{column: NAME, unit: s"
     ):
         read(tmp_path / "a.csv")
     check(tmp_path / "a.csv", time=TimeColumn(rate=100.0))
@@ -280,7 +280,7 @@ def test_a_ride_whose_times_begin_at_0_gets_a_start(tmp_path: Path) -> None:
     times, _, account = read(tmp_path / "a.csv", start=START)
     assert times[0] == START
     assert account.relative
-    assert account.problems == ["its times count from a start of their own: 2026-09-21 14:13:20 UTC is taken for it"]
+    assert account.problems == ["its times count from an unknown start: 2026-09-21 14:13:20 UTC is assumed"]
     (tmp_path / "b.csv").write_text(table(times=SECONDS + START / 1e9))
     times, _, account = read(tmp_path / "b.csv", start=5)
     assert abs(times[0] - START) < 300

@@ -1,4 +1,4 @@
-"""From judged windows without measured inputs to the report: findings, values, sentences, frequencies over time."""
+"""Report of a recording without measured inputs: findings, values, sentences, frequencies over time."""
 
 from __future__ import annotations
 
@@ -36,40 +36,26 @@ def compose_unforced(
     options: Options,
     windows: list[WindowResult],
     pooled: Pooled,
-    said: AmbientJudgement,
+    judgement: AmbientJudgement,
 ) -> Report:
     """The report of a recording without measured inputs."""
     names = prepared.signals.sensor_names
     rules = options.rules.ambient
-    errors, left = said.errors, said.left
+    errors, left = judgement.errors, judgement.left
+    where = _where(names, judgement) if np.any(left > 0) else ""
     findings = _findings(system, prepared, windows, pooled, rules)
-    where = ""
-    if np.any(left > 0):
-        worst = int(np.argmax(left))
-        where = (
-            f"{100 * errors.after[worst] ** 2:.0f} % of the power of {names[worst]} is at other frequencies than the "
-            f"structure has it, most at {said.band[0]:.3g} to {said.band[1]:.3g} Hz"
-        )
-    if said.verdict == "unknown_physics":
+    if judgement.verdict == "unknown_physics":
         place = names[int(np.argmax(errors.after))]
         sentence = f"a misfit that no law explains: {where}"
         findings.insert(0, Finding(place, UNKNOWN, EffectKind.UNLISTED, (), None, None, sentence=sentence))
     track = tuple(_point(system, window) for window in windows)
-    values = tuple(
-        ReportedParameter(p.name, value, value * float(s), p.nominal, p.unit)
-        for p, value, s in zip(
-            system.parameters,
-            (np.array([p.nominal for p in system.parameters]) * np.exp(pooled.log_ratio)).tolist(),
-            pooled.deviation.tolist(),
-            strict=True,
-        )
-    )
+    values = _values(system, pooled)
     return Report(
         system=system.name,
         recording=RecordingFacts(
             options.file, len(record.values) / record.sample_rate, len(record.values), int(record.lost)
         ),
-        verdict=said.verdict,
+        verdict=judgement.verdict,
         baseline=values,
         baseline_validation=figures(names, errors.before),
         findings=tuple(findings),
@@ -77,12 +63,31 @@ def compose_unforced(
         augmented_validation=figures(names, errors.after),
         noise_floor=figures(names, errors.bounded(options.rules.verdict)),
         localization={},
-        explained=said.explained,
+        explained=judgement.explained,
         unexplained=Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), where),
-        summary=_summary(said.verdict, findings, track, where),
-        advice=tuple(_advice(system, pooled, said, windows, rules)),
+        summary=_summary(judgement.verdict, findings, track, where),
+        advice=tuple(_advice(system, pooled, judgement, windows, rules)),
         track=track,
         plot_data=_arrays(track),
+    )
+
+
+def _where(names: tuple[str, ...], judgement: AmbientJudgement) -> str:
+    """The sensor with most power at other frequencies than the model's, and these frequencies, in words."""
+    worst, (low, high) = int(np.argmax(judgement.left)), judgement.band
+    share = 100 * judgement.errors.after[worst] ** 2
+    return (
+        f"{share:.0f} % of the power of {names[worst]} is at other frequencies than the structure has it, "
+        f"most at {low:.3g} to {high:.3g} Hz"
+    )
+
+
+def _values(system: System, pooled: Pooled) -> tuple[ReportedParameter, ...]:
+    """Parameters with their means over windows."""
+    ratios = zip(np.exp(pooled.log_ratio).tolist(), pooled.deviation.tolist(), strict=True)
+    return tuple(
+        ReportedParameter(p.name, p.nominal * ratio, p.nominal * ratio * std, p.nominal, p.unit)
+        for p, (ratio, std) in zip(system.parameters, ratios, strict=True)
     )
 
 
@@ -103,7 +108,7 @@ def _findings(
     ]
     for p in np.flatnonzero(pooled.varying):
         parameter = system.parameters[int(p)]
-        sure = [w for w in windows if w.covariance[p, p] < rules.told**2]
+        sure = [w for w in windows if w.covariance[p, p] < rules.undetermined**2]
         sure = [w for w in sure if w.adequate and w.covariance[p, p] < rules.sure**2] or sure
         ends = [min(sure, key=lambda w: w.log_ratio[p]), max(sure, key=lambda w: w.log_ratio[p])]
         low, high = (
@@ -126,7 +131,7 @@ def _findings(
 
 
 def modes_at(system: System, log_ratio: FloatArray) -> list[Mode]:
-    """Natural modes with other values, by frequency."""
+    """Natural modes at given log-ratios, by frequency."""
     values = {p.name: p.nominal * float(np.exp(x)) for p, x in zip(system.parameters, log_ratio, strict=True)}
     mechanics = system.mechanics
     stiffness = [values.get(f"{e}.stiffness", k) for e, k in zip(system.elements, mechanics.stiffness, strict=True)]
@@ -137,7 +142,7 @@ def modes_at(system: System, log_ratio: FloatArray) -> list[Mode]:
 
 
 def _point(system: System, window: WindowResult) -> TrackPoint:
-    """Frequencies with deviations by differences along every parameter."""
+    """Natural frequencies with standard deviations, by finite differences."""
     frequency = np.array([mode.frequency for mode in modes_at(system, window.log_ratio)])
     slopes = []
     for p in range(len(window.log_ratio)):
@@ -155,30 +160,30 @@ def _summary(verdict: str, findings: list[Finding], track: tuple[TrackPoint, ...
     lowest = f"lowest natural frequency {np.min(seen):.4g} to {np.max(seen):.4g} Hz over {len(seen)} windows"
     text = "; ".join(f.sentence for f in findings)
     if verdict == "consistent":
-        text = "The nominal structure explains the spectra of the sensors; what excites it was not measured"
+        text = "The nominal structure explains the spectra of the sensors; its excitation was not measured"
     elif where and verdict != "unknown_physics":
         text += f"; still unexplained: {where}"
     return f"{text}; {lowest}."
 
 
 def _advice(
-    system: System, pooled: Pooled, said: AmbientJudgement, windows: list[WindowResult], rules: AmbientRules
+    system: System, pooled: Pooled, judgement: AmbientJudgement, windows: list[WindowResult], rules: AmbientRules
 ) -> list[str]:
     words = []
     adequate = float(np.mean([w.adequate for w in windows]))
-    if said.rejected:
+    if judgement.rejected:
         words.append(
             "nothing fits: the structure of the system file does not have these spectra. Likeliest: bodies or modes "
             "that the file does not have; masses or stiffnesses far from nominal; an excitation with lines of its own "
             "(a machine)"
         )
     if adequate < 0.5:
-        words.append(f"only {100 * adequate:.0f} % of the windows are explained down to chance")
-    if float(np.mean(said.errors.floor**2)) > rules.coarse:
-        words.append("so few windows would hardly show a wrong structure: record longer")
-    loose = [p.name for p, std in zip(system.parameters, pooled.deviation, strict=True) if std > rules.told]
+        words.append(f"only {100 * adequate:.0f} % of the windows are explained down to random errors")
+    if float(np.mean(judgement.errors.floor**2)) > rules.coarse:
+        words.append("too few windows to reveal a wrong structure: record longer")
+    loose = [p.name for p, std in zip(system.parameters, pooled.deviation, strict=True) if std > rules.undetermined]
     if loose:
-        words.append(f"undecided without measured inputs: {', '.join(loose)}; longer windows tell more")
+        words.append(f"undecided without measured inputs: {', '.join(loose)}; longer windows determine more")
     return words
 
 

@@ -1,4 +1,4 @@
-"""Whether a recording without inputs is one free decay: then it is simulated from its first sample."""
+"""Detection of free decays in recordings without inputs: they are simulated from their first sample."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from sprung.model.signals import FloatArray
 
 
 def decay_stretch(signals: Signals, noise: FloatArray, all_rules: Rules = RULES) -> slice | None:
-    """The samples in which the sensors only decay, with noise (S,) of one sample; None where they do not.
+    """The stretch in which the sensors decay; None if they do not.  noise: of one sample, (S,).
 
-    What stands still afterwards is left out: it tells nothing, and a held-out part of it could not judge anything.
+    Standstill at the end is excluded: it is uninformative, also as a held-out part.
     """
     rules = all_rules.ambient
     begin = _begin(signals, noise, rules)

@@ -1,8 +1,8 @@
-"""The diagnosis of recordings without measured inputs: what a structure is made of, not what excites it.
+"""Diagnosis of recordings without measured inputs (output-only): the structure, not its excitation.
 
-Nothing can be simulated from its inputs here.  What is compared is the spectrum of the sensors in windows: identified
-parameters fitted to the first part of the recording, powers of the rest against the model's.  Errors are square roots
-of the share of power that the model puts at other frequencies than measured.
+Without inputs there is no simulation; the spectra of the sensors in windows are compared instead.  Parameters are
+identified on the first part of the recording, and the power spectra of the rest are compared with the model's.  Errors
+are square roots of the share of power at other frequencies than the model's.
 """
 
 from __future__ import annotations
@@ -26,21 +26,23 @@ from sprung.model.diagnosis.report.report import (
 from sprung.model.system import System
 
 
-def diagnose_unforced(system: System, prepared: Prepared, record: Recorded, options: Options, tell: Progress) -> Report:
+def diagnose_unforced(
+    system: System, prepared: Prepared, record: Recorded, options: Options, progress: Progress
+) -> Report:
     """Diagnose a recording of sensors alone.
 
-    Errors: `TooLittleError` where no window tells anything.
+    Errors: `TooLittleError` if no window is informative.
     """
     signals = prepared.signals
     rules, memory = options.rules.ambient, options.memory or FitMemory()
-    windows, note = all_windows(system, signals, rules, memory, lambda share: tell(0.05 + 0.5 * share, "windows"))
+    windows, note = all_windows(system, signals, rules, memory, lambda share: progress(0.05 + 0.5 * share, "windows"))
     if not windows:
         seconds = min(system.window, signals.samples) / system.sample_rate
         raise TooLittleError(
-            f"no input is measured and no window of {seconds:g} s tells anything: it must hold some ten periods of the "
+            f"no input is measured and no window of {seconds:g} s is informative: it must hold some ten periods of the "
             "lowest mode, above the sensors' noise; lengthen `window`, or measure what excites the structure"
         )
-    tell(0.6, "what all windows say together")
+    progress(0.6, "means over all windows")
     split = signals.start + options.rules.record.fitted * signals.samples / signals.sample_rate
     first = [w for w in windows if w.end <= split] or windows
     pooled = pool(first if len(first) >= rules.independent else windows, rules)
@@ -48,13 +50,13 @@ def diagnose_unforced(system: System, prepared: Prepared, record: Recorded, opti
     notes = [note] if note else []
     if not held:
         held = windows[-1:]
-        notes.append("the recording is too short to hold a part back: what was fitted was judged on the same window")
-    tell(0.8, "the last part under what the first part told")
+        notes.append("the recording is too short for a held-out part: the fit was judged on the same window")
+    progress(0.8, "validation on the last part")
     shared = with_known(system, signals, held, pooled.log_ratio, memory) or held
     varying = bool(np.any(pooled.varying))
     errors, band = errors_of(shared, held if varying else shared, rules)
-    tell(0.95, "report")
-    said = judged(prepared, system, pooled, errors, band, options)
-    report = compose_unforced(system, prepared, record, options, windows, pooled, said)
-    tell(1.0, "done")
+    progress(0.95, "report")
+    judgement = judged(prepared, system, pooled, errors, band, options)
+    report = compose_unforced(system, prepared, record, options, windows, pooled, judgement)
+    progress(1.0, "done")
     return replace(report, advice=(*prepared.notes, *notes, *report.advice))

@@ -1,4 +1,4 @@
-"""Windows without measured inputs judged: what they say together, their errors, and the verdict."""
+"""Judgement of windows without measured inputs: pooled values, errors, and the verdict."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ VARYING: dict[str, ElementLaw] = {"stiffness": TIME_VARYING_STIFFNESS, "damping"
 
 @dataclass(frozen=True)
 class Pooled:
-    """What all windows say together."""
+    """Values pooled over all windows."""
 
     log_ratio: FloatArray  # (P,)
-    deviation: FloatArray  # (P,), with the scatter over windows
-    varying: BoolArray  # parameters that differ from window to window beyond chance, (P,)
-    chance: FloatArray  # of such a scatter, (P,)
+    deviation: FloatArray  # standard deviation, (P,), scatter over windows included
+    varying: BoolArray  # parameters that vary significantly over windows, (P,)
+    chance: FloatArray  # p-value of their scatter, (P,)
 
 
 @dataclass(frozen=True)
 class AmbientJudgement:
-    """What a recording without measured inputs comes to."""
+    """Result of a recording without measured inputs."""
 
     errors: HeldOutErrors  # per sensor
     verdict: Verdict
-    explained: float | None  # share of the excess error, where anything was found
+    explained: float | None  # share of the excess error; None without findings
     left: FloatArray  # unexplained share of every sensor's power, (S,)
-    band: tuple[float, float]  # Hz, where most of what is left lies
-    rejected: bool  # another structure than the file's
+    band: tuple[float, float]  # Hz, main band of the unexplained power
+    rejected: bool  # whether the structure differs from the file's
 
 
 def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Pooled:
-    """Weighted means over windows, and which parameters differ between them."""
+    """Weighted means over windows, and the parameters that vary."""
     theta = np.array([w.log_ratio for w in windows])
     sigma = np.sqrt(np.array([np.diag(w.covariance) for w in windows]))
     P = theta.shape[1]
@@ -53,11 +53,11 @@ def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Po
     varying, chance = np.zeros(P, dtype=bool), np.ones(P)
     apart = independent(windows)
     for p in range(P):
-        tells = sigma[:, p] < rules.told
-        if not tells.any():
+        informative = sigma[:, p] < rules.undetermined
+        if not informative.any():
             continue
-        value, std = theta[tells, p], sigma[tells, p]
-        one = apart & tells
+        value, std = theta[informative, p], sigma[informative, p]
+        one = apart & informative
         if one.sum() >= rules.independent:
             own, own_std = theta[one, p], sigma[one, p]
             centre = np.sum(own / own_std**2) / np.sum(1 / own_std**2)
@@ -67,7 +67,7 @@ def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Po
             varying[p] = chance[p] < rules.alpha and wide > max(rules.varies, rules.spread * float(np.median(own_std)))
         mean[p] = float(np.median(value)) if varying[p] else float(np.sum(value / std**2) / np.sum(1 / std**2))
         number = max(1, int(one.sum()))
-        inside = 1 / np.sqrt(np.sum(1 / std**2) * number / len(std))  # overlapping windows tell the same thing twice
+        inside = 1 / np.sqrt(np.sum(1 / std**2) * number / len(std))  # overlapping windows are not independent
         between = float(np.std(value)) / np.sqrt(number) if number >= rules.independent else 0.0
         deviation[p] = max(inside, between)
     return Pooled(mean, deviation, varying, chance)
@@ -76,7 +76,7 @@ def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Po
 def errors_of(
     before: list[WindowResult], after: list[WindowResult], rules: AmbientRules
 ) -> tuple[HeldOutErrors, tuple[float, float]]:
-    """Before: one value of every parameter for all windows; after: with what varies."""
+    """Errors with constant parameters (before), and with the varying ones free (after)."""
     one, chance, _ = displaced([w for w, good in zip(before, independent(before), strict=True) if good], rules.parts)
     own, _, band = displaced([w for w, good in zip(after, independent(after), strict=True) if good], rules.parts)
     return HeldOutErrors(np.sqrt(one), np.sqrt(own), np.sqrt(chance)), band
@@ -94,7 +94,9 @@ def judged(
     rules = options.rules
     kinds = [kind_of(SENSOR_STUCK)] * len(prepared.stuck)
     kinds += [kind_of(VARYING[system.parameters[int(p)].quantity]) for p in np.flatnonzero(pooled.varying)]
-    verdict = verdict_of(kinds, errors, replace(rules.verdict, gross=1.0))  # of power elsewhere, no run's error
+    verdict = verdict_of(
+        kinds, errors, replace(rules.verdict, gross=1.0)
+    )  # errors are shares of power, not of a simulation
     return AmbientJudgement(
         errors=errors,
         verdict=verdict,

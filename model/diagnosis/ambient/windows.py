@@ -1,4 +1,4 @@
-"""A recording without measured inputs as windows, each with its parameters and how well the structure explains it."""
+"""Windows of a recording without measured inputs, each with parameters and goodness of fit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sprung.model.diagnosis.rules import AmbientRules
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
-Told = Callable[[float], None]
+Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Powers:
 
     frequency: FloatArray  # Hz, (F,)
     whole: FloatArray  # (F, S)
-    rest: FloatArray  # without what the window's start and end explain, (F, S)
+    rest: FloatArray  # without the transients of the window's ends, (F, S)
     expected: FloatArray  # of the rest, by the model, (F, S)
     count: FloatArray  # degrees of freedom of every bin, (F,)
 
@@ -47,44 +47,44 @@ class WindowResult:
 
 
 class ShakenStructure:
-    """Windows of a structure under forces that nobody measured."""
+    """Windows of a structure under unmeasured forces."""
 
     def __init__(self, system: System, signals: Signals) -> None:
         self.system, self.signals, self.window = system, signals, TransientWindow(system)
 
     def result(self, start: int, stop: int, known: FloatArray | None) -> WindowResult | None:
-        """Of a window of samples; with `known` log-ratios only the forces' levels are fitted."""
-        told = self.window.told(self.signals.sensors[start:stop], self.signals.sensor_index, None, known)
-        if told is None:
+        """Result of a window of samples; with `known` log-ratios (P,) only force levels are fitted."""
+        fit = self.window.fit(self.signals.sensors[start:stop], self.signals.sensor_index, None, known)
+        if fit is None:
             return None
         P = len(self.system.parameters)
-        powers = Powers(told.frequency, told.whole, told.rest, told.expected, np.ones(len(told.frequency)))
+        powers = Powers(fit.frequency, fit.whole, fit.rest, fit.expected, np.ones(len(fit.frequency)))
         at = times(self.signals, start, stop)
-        return WindowResult(*at, told.fitted.x[:P], told.covariance[:P, :P], told.adequate, powers)
+        return WindowResult(*at, fit.fitted.x[:P], fit.covariance[:P, :P], fit.adequate, powers)
 
 
 class UnmeasuredTrack:
-    """Windows of a vehicle on a track that nobody measured."""
+    """Windows of a vehicle on an unmeasured track."""
 
     def __init__(self, system: System, signals: Signals) -> None:
         self.system, self.signals, self.identifier = system, signals, AmbientIdentifier(system)
 
     def result(self, start: int, stop: int, known: FloatArray | None) -> WindowResult | None:
-        """Of a window of samples; its parameters are always its own."""
+        """Result of a window of samples; `known` is ignored: its parameters are always fitted."""
         system, sensors = self.system, self.signals.sensor_index
         window = np.full((stop - start, len(system.channels)), np.nan)
         window[:, : len(system.inputs)] = self.signals.speed[start:stop]
         window[:, len(system.inputs) + sensors] = self.signals.sensors[start:stop]
-        told = self.identifier.told(window)
-        if told is None:
+        fit = self.identifier.fit(window)
+        if fit is None:
             return None
         present = np.isin(np.arange(len(system.sensors)), sensors)
-        estimate = as_estimate(told, len(system.parameters), present)
+        estimate = as_estimate(fit, len(system.parameters), present)
         sensed = sensing(system.mechanics, sensors, system.sensor_noise[sensors])
         back = np.linalg.pinv(sensed.rows)
-        seen = np.einsum("sr,frt,st->fs", back, sensed.seen(told.spectra.matrix), back).real
-        expected = np.einsum("sr,frt,st->fs", back, told.fitted.at.covariance, back).real
-        powers = Powers(told.spectra.frequency, seen, seen, expected, told.spectra.weight)
+        seen = np.einsum("sr,frt,st->fs", back, sensed.seen(fit.spectra.matrix), back).real
+        expected = np.einsum("sr,frt,st->fs", back, fit.fitted.at.covariance, back).real
+        powers = Powers(fit.spectra.frequency, seen, seen, expected, fit.spectra.weight)
         at = times(self.signals, start, stop)
         return WindowResult(*at, estimate.log_ratio, estimate.covariance, estimate.adequate, powers)
 
@@ -95,7 +95,7 @@ def times(signals: Signals, start: int, stop: int) -> tuple[float, float]:
 
 
 def stretches(system: System, signals: Signals, rules: AmbientRules) -> tuple[list[tuple[int, int]], str]:
-    """First and last samples of the windows, half overlapping, and what was left out, in words."""
+    """First and last samples of half-overlapping windows, and omitted parts in words."""
     length = min(system.window, signals.samples)
     hop = max(1, length // 2)
     starts = list(range(0, signals.samples - length + 1, hop))
@@ -113,7 +113,7 @@ def stretches(system: System, signals: Signals, rules: AmbientRules) -> tuple[li
 
 @dataclass(frozen=True)
 class _Remembering:
-    """Windows that are looked at once, however often they are asked for."""
+    """Cache of windows."""
 
     looked: ShakenStructure | UnmeasuredTrack
     memory: FitMemory
@@ -125,15 +125,15 @@ class _Remembering:
 
 
 def all_windows(
-    system: System, signals: Signals, rules: AmbientRules, memory: FitMemory, tell: Told
+    system: System, signals: Signals, rules: AmbientRules, memory: FitMemory, progress: Progress
 ) -> tuple[list[WindowResult], str]:
-    """Every window that tells anything, and what was left out, in words."""
+    """All informative windows, and omitted parts in words."""
     kind = UnmeasuredTrack if system.on_track else ShakenStructure
     looked = _Remembering(kind(system, signals), memory)
     cuts, note = stretches(system, signals, rules)
     found = []
     for number, (start, stop) in enumerate(cuts):
-        tell(number / len(cuts))
+        progress(number / len(cuts))
         result = looked.result(start, stop, None)
         if result is not None:
             found.append(result)
@@ -143,7 +143,7 @@ def all_windows(
 def with_known(
     system: System, signals: Signals, windows: list[WindowResult], known: FloatArray, memory: FitMemory
 ) -> list[WindowResult]:
-    """The same windows under parameters (P,) that all of them share."""
+    """The same windows with common parameters (P,)."""
     if system.on_track:
         return windows
     looked, again = _Remembering(ShakenStructure(system, signals), memory), []
@@ -156,10 +156,9 @@ def with_known(
 
 
 def displaced(windows: list[WindowResult], parts: int) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
-    """Share of every sensor's power that the model puts at other frequencies, what chance gives, and where most is.
+    """Share of every sensor's power at other frequencies than the model's, (S,), its value under random errors, (S,).
 
-    parts: of the band, in which powers are compared.
-    Shares (S,) and (S,), frequencies in Hz.  Chance is that of the measured bins, whatever the model expects.
+    Third, the band with most of it, Hz.  parts: number of bands in which powers are compared.
     """
     frequency = windows[0].powers.frequency
     edges = np.linspace(frequency[0], frequency[-1] * (1 + 1e-9), min(parts, max(1, len(frequency) // 4)) + 1)
@@ -170,7 +169,9 @@ def displaced(windows: list[WindowResult], parts: int) -> tuple[FloatArray, Floa
         powers = window.powers
         place = np.clip(np.digitize(powers.frequency, edges) - 1, 0, len(edges) - 2)
         np.add.at(apart, place, powers.count[:, None] * (powers.rest - powers.expected))
-        np.add.at(chance, place, powers.count[:, None] * powers.rest**2 / 2)  # bins are exponential about their mean
+        np.add.at(
+            chance, place, powers.count[:, None] * powers.rest**2 / 2
+        )  # periodogram bins are exponentially distributed
         whole += powers.count @ np.maximum(powers.whole, np.maximum(powers.rest, powers.expected))
     share = 0.5 * np.abs(apart) / np.maximum(whole, 1e-300)
     by_chance = 0.5 * np.sqrt(2 / np.pi * chance) / np.maximum(whole, 1e-300)
@@ -179,7 +180,7 @@ def displaced(windows: list[WindowResult], parts: int) -> tuple[FloatArray, Floa
 
 
 def independent(windows: list[WindowResult]) -> BoolArray:
-    """Windows that share no sample with an earlier chosen one, (W,)."""
+    """Mask (W,) of windows without overlap."""
     chosen, last = np.zeros(len(windows), dtype=bool), -np.inf
     for i, window in enumerate(windows):
         if window.begin >= last - 1e-9:

@@ -1,4 +1,4 @@
-"""Laws that look alike to a record: what else may stand in the place of a law that was found."""
+"""Look-alikes: other laws that explain a record almost as well as one that was found."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sprung.model.signals import FloatArray
 
 @dataclass(frozen=True)
 class Alike:
-    """A model with another law, or another form of one, in one place."""
+    """A model with one law replaced by another, or by another form of it."""
 
     index: int
     fit: ComponentFit
@@ -27,16 +27,15 @@ class Alike:
 
     @property
     def moved(self) -> FloatArray:
-        """By how much what both have in common differs."""
+        """Differences of the values that both models share, in the order of `covariance`."""
         return moved_in_common(self.fit, self.found)
 
 
 def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple[Alike, ...]:
-    """What a record does not tell from the laws of a model, which were found in `steps` and begin at `first`.
+    """Look-alikes of the laws of a model, which were found in `steps` and begin at index `first`.
 
-    Those of almost the same evidence.  Where a model leaves more than noise, it is not quite what is there, and the
-    evidence tells which of two wrong laws comes closer, not which is nearer to the truth: then those, too, that leave
-    hardly more.
+    These are the laws of almost the same evidence.  If the model leaves more than noise it is not exact, and evidence
+    ranks approximations, not truths: laws that leave hardly more error are then included.
     """
     task = final.task.every(max(1, len(final.task.force) // final.task.rules.search))
     here, found = refined(task, final.model), []

@@ -1,4 +1,4 @@
-"""From judged component tests to the report: findings, values, sentences, arrays for pictures."""
+"""Report of component tests: findings, values, sentences, arrays for plots."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ from sprung.model.system import System
 
 
 def compose_components(
-    system: System, record: Recorded, options: Options, judged: Sequence[Judged], said: ComponentJudgement
+    system: System, record: Recorded, options: Options, judged: Sequence[Judged], judgement: ComponentJudgement
 ) -> Report:
     """The report of component tests."""
-    errors, left = said.errors, said.left
+    errors, left = judgement.errors, judgement.left
     findings = sorted((f for one in judged for f in _findings(one)), key=_rank)
     names = [j.record.sensor for j in judged]
     words = "; ".join(leftover_words(j.record.element, j.final, j.size) for j, x in zip(judged, left, strict=True) if x)
@@ -52,7 +52,7 @@ def compose_components(
         recording=RecordingFacts(
             options.file, len(record.values) / record.sample_rate, len(record.values), int(record.lost)
         ),
-        verdict=said.verdict,
+        verdict=judgement.verdict,
         baseline=tuple(p for j in judged for p in _parameters(system, j.record.element, j.base, covariance(j.base))),
         baseline_validation=figures(names, errors.before),
         findings=tuple(findings),
@@ -63,18 +63,18 @@ def compose_components(
             j.record.element: level_gain(j.base.error, j.final.error, effective_count(j.final.residual)) for j in judged
         },
         candidates=tuple(c for j in judged for c in _candidates(j)),
-        explained=said.explained,
+        explained=judgement.explained,
         laws=tuple(law for j in judged for law in _laws(j)),
         noise={j.record.sensor: j.record.task.noise for j in judged if j.record.task.noise > 0},
         unexplained=unexplained,
-        summary=_summary(said, findings, unexplained),
-        advice=tuple(advice if said.verdict != "consistent" else []),
+        summary=_summary(judgement, findings, unexplained),
+        advice=tuple(advice if judgement.verdict != "consistent" else []),
         plot_data=_arrays(judged),
     )
 
 
 def _rank(finding: Finding) -> tuple[int, float]:
-    """Set-up faults first, laws by evidence, nuisances last."""
+    """Sort key: set-up faults, laws by evidence, nuisances."""
     order = {EffectKind.FAULT: 0, EffectKind.NUISANCE: 2}.get(finding.kind, 1)
     return order, finding.delta_bic if finding.delta_bic is not None else 0.0
 
@@ -106,15 +106,15 @@ def _findings(one: Judged) -> list[Finding]:
 
 
 def _laws(one: Judged) -> tuple[IdentifiedLaw, ...]:
-    """What a system file takes over: laws that are given or named, and the preload."""
+    """Laws for the system file: given and named ones, and the preload."""
     count = len(one.record.given.pieces) + (len(one.found.steps) if one.named else 0)
     return identified_laws(one.final, one.record.element, count, *one.covariance, -1.0 if one.reversed else 1.0)
 
 
 def _parameters(
-    system: System, element: str, fit: ComponentFit, told: tuple[FloatArray, list[str]]
+    system: System, element: str, fit: ComponentFit, covariance: tuple[FloatArray, list[str]]
 ) -> list[ReportedParameter]:
-    full, names = told
+    full, names = covariance
     sigma = dict(zip(names, np.sqrt(np.maximum(np.diag(full), 0.0)).tolist(), strict=False))
     values = []
     for parameter in system.parameters:
@@ -140,27 +140,27 @@ def _candidates(one: Judged) -> list[CandidateRow]:
     return list(rows.values())[:20]
 
 
-def _summary(said: ComponentJudgement, findings: list[Finding], left: Unexplained) -> str:
-    if said.verdict == "consistent":
+def _summary(judgement: ComponentJudgement, findings: list[Finding], left: Unexplained) -> str:
+    if judgement.verdict == "consistent":
         text = "The nominal structure explains the recording down to the noise."
         nuisance = "; ".join(f.sentence for f in findings)
         return f"{text} {nuisance[:1].upper()}{nuisance[1:]}." if nuisance else text
-    told = [f for f in findings if f.kind is not EffectKind.NUISANCE]
-    text = "; ".join(f.sentence for f in told)
+    main = [f for f in findings if f.kind is not EffectKind.NUISANCE]
+    text = "; ".join(f.sentence for f in main)
     if not text:
-        text = "No law of the catalogue explains what was measured"
-    if said.explained is not None and said.explained > 0:
-        share = 100 * said.explained
+        text = "No law of the catalogue explains the measured force"
+    if judgement.explained is not None and judgement.explained > 0:
+        share = 100 * judgement.explained
         exact = "100" if left.share == 0 else f"{min(share, 99):.0f}"
         text += f"; explains {exact} % of the excess error"
     if left.share > 0:
         text += f"; still unexplained: {left.where}"
-    nuisance = "; ".join(f.sentence for f in findings if f not in told)
+    nuisance = "; ".join(f.sentence for f in findings if f not in main)
     return f"{text}{'; ' + nuisance if nuisance else ''}."
 
 
 def _arrays(judged: Sequence[Judged]) -> dict[str, np.ndarray]:
-    """Arrays for pictures: validation of every force, and for every law motion and force before and after."""
+    """Arrays for plots: validation of every force; motion and force before and after every law."""
     first = judged[0]
     arrays: dict[str, np.ndarray] = {}
     if all(len(j.record.task.force) == len(first.record.task.force) for j in judged):
@@ -189,7 +189,7 @@ def _arrays(judged: Sequence[Judged]) -> dict[str, np.ndarray]:
 
 
 def _columns_of_findings(one: Judged) -> list[slice]:
-    """Which columns of the model every finding is: one law's, or all of what is unnamed."""
+    """Columns of the model for every finding: of one law, or of all laws of an unnamed force."""
     counts = [len(piece.signs) for piece in one.final.model.pieces]
     given, steps = len(one.record.given.pieces), len(one.found.steps)
     if not one.named:

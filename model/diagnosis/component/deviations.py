@@ -1,16 +1,15 @@
-"""How far the numbers of a fitted component may be from the truth, as the record itself shows it.
+"""Uncertainty of the values of a fitted component, estimated from the record itself.
 
-Chance: errors that repeat with every cycle of a test do not average out, so the covariance is the sandwich
+Random errors: errors that repeat with every cycle of a test do not average out, so the covariance is the sandwich
 
     (J^T J)^-1  [sum over bins of J_f^H J_f |r_f|^2]  (J^T J)^-1
 
-with the residual's raw periodogram |r_f|^2 (White 1980, in the frequency domain), which counts an error at a test's
-own frequency with its full size; never less than what white noise of the residual's level would give, nor than the
-same sum over stretches of time, of which the loud ones alone have told the numbers and made the errors.
+with the residual's raw periodogram |r_f|^2 (White 1980, in the frequency domain), which counts errors at the test
+frequency in full; at least as large as for white noise of the residual's level, and as the same sum over segments of
+time, since loud segments dominate both estimates and errors.
 
-What chance does not tell (`left_open`) is found by moving the numbers: noise and sampling of the motion, the part of
-the record that was not fitted, a force of no law as large as what is left, a delay of the force's channel, and laws
-that look alike.
+Systematic errors (`left_open`) are estimated by perturbation: noise and sampling of the motion, the held-out part of
+the record, a discrepancy force as large as the residual, a delay of the force channel, and look-alike laws.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from sprung.model.laws import SpringDamper
 from sprung.model.signals import FloatArray
 
 _RELATIVE = 1e-4  # steps of finite differences
-_SEEN = 1e-3  # of a column's size: less of it is not seen beside the laws
-_SETTLED = 1e-10  # of the largest singular value: directions below it are told by nothing
+_SEEN = 1e-3  # of a column's norm, below which it is unobservable beside the laws
+_SETTLED = 1e-10  # of the largest singular value, below which directions are unobservable
 
 
 def covariance(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
-    """Covariance of preload, k, c (where free), strengths and shapes, in this order, by chance; names of the first."""
+    """Random part of the covariance of preload, k, c (where free), strengths and shapes; names of the first ones."""
     task = fit.task
     jacobian, names = _jacobian(fit)
     train = slice(0, task.split)
@@ -52,14 +51,14 @@ def covariance(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
 
 
 def _sought(fit: ComponentFit) -> FloatArray:
-    """The range in which every shape is sought, which is what is known of it where nothing depends on it; else 0."""
+    """Prior widths: the search range of every shape, 0 for other values."""
     limits = [limit for piece in fit.model.pieces for limit in piece.limits(fit.task.seen)]
     linear = int(fit.task.linear[1].sum()) + len(fit.strengths)
     return np.concatenate([np.zeros(linear), [high - low for low, high in limits]])
 
 
 def _normal(jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lengths of a Jacobian's columns, and (J^T J)^-1 of the columns of length one."""
+    """Norms of a Jacobian's columns, and (J^T J)^-1 of the normalised columns."""
     scale = np.linalg.norm(jacobian, axis=0)
     scale[scale == 0] = 1.0
     unit = jacobian / scale
@@ -67,7 +66,7 @@ def _normal(jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _jacobian(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
-    """Derivatives of the modelled force by everything that is fitted, (T, P), and the names of the first of it."""
+    """Derivatives of the modelled force by all fitted values, (T, P), and the names of the first ones."""
     task, model = fit.task, fit.model
     shown, moved = task.through(model.channel), []
     base, free, _ = shown.linear
@@ -85,9 +84,9 @@ def _jacobian(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
 
 
 def left_open(fit: ComponentFit, alike: Sequence[FloatArray] = ()) -> FloatArray:
-    """Squares of what the record leaves open besides chance, as `covariance` counts the numbers.
+    """Systematic part of the covariance, in the order of `covariance`.
 
-    alike: by how much laws that look alike move the numbers (`moved_in_common`).
+    alike: changes of the values with look-alike laws (`moved_in_common`).
     """
     jacobian, _ = _jacobian(fit)
     moved = [*_by_motion(fit), _by_the_rest(fit, jacobian), *alike]
@@ -99,10 +98,10 @@ def left_open(fit: ComponentFit, alike: Sequence[FloatArray] = ()) -> FloatArray
 
 
 def _by_motion(fit: ComponentFit) -> Iterator[FloatArray]:
-    """By the motion's noise and its sampling, which both bias what is fitted along a measured motion.
+    """Changes by noise and sampling of the motion, which both bias fits along a measured motion.
 
-    As much noise again moves the numbers by about as much as what is there has done (Cook and Stefanski 1994), half
-    the samples by no less than what is missing between them.
+    Adding noise of the same level changes the values about as much as the noise present (simulation-extrapolation,
+    Cook and Stefanski 1994); halving the sample rate at least as much as the sampling.
     """
     task = fit.task
     half = task.every(2)
@@ -112,17 +111,17 @@ def _by_motion(fit: ComponentFit) -> Iterator[FloatArray]:
 
 
 def _by_the_rest(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
-    """By fitting the whole record, in one step: another part has other loops and rates."""
+    """Changes by a Gauss-Newton step on the whole record, whose held-out part has other amplitudes and rates."""
     scale, inverse = _normal(jacobian)
     rest = slice(fit.task.split, None)
     return np.asarray(inverse @ ((jacobian[rest] / scale).T @ fit.residual[rest]) / scale)
 
 
 def _by_what_is_left(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
-    """By a force of no law as large as what is left beyond noise (Kennedy and O'Hagan 2001), a covariance (P, P).
+    """Covariance (P, P) due to a discrepancy force as large as the residual beyond noise (Kennedy and O'Hagan 2001).
 
-    A force over deflection, rate and memory has a part that the laws have taken up, and one that is seen: its columns'
-    sizes are drawn at random with the variance that explains the part that is seen.
+    The discrepancy is a function of deflection, rate and memory with random amplitudes.  The laws absorb part of it;
+    the variance of the amplitudes explains the rest, which is observable.
     """
     columns = fit.task.through(fit.model.channel).columns_of(SURFACE, ())
     columns = columns / np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-300)
@@ -132,17 +131,19 @@ def _by_what_is_left(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
     basis, sizes, _ = np.linalg.svd(seen, full_matrices=False)
     basis = basis[:, sizes > _SEEN * np.sqrt(len(seen))]
     inside, whole = float(np.sum((basis.T @ fit.residual) ** 2)), float(fit.residual @ fit.residual)
-    chance = basis.shape[1] * (whole - inside) / max(1, len(seen) - basis.shape[1])  # noise lies in all directions
+    chance = (
+        basis.shape[1] * (whole - inside) / max(1, len(seen) - basis.shape[1])
+    )  # share of noise, which is isotropic
     power = max(inside - chance, 0.0) / max(float(np.sum(sizes**2)), 1e-300)
     moved = taken / scale[:, None]
     return np.asarray(power * moved @ moved.T)
 
 
 def _by_delay(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
-    """By a delay of the force's channel that the model does not have, a covariance (P, P).
+    """Covariance (P, P) due to an unmodelled delay of the force channel.
 
-    As large as instruments leave it, as far as it would not leave more than what passes for noise: at one frequency a
-    spring and a damper take all of it up.
+    Its standard deviation is that of the instruments, limited by what the residual allows; at a single frequency
+    spring and damper absorb a delay completely.
     """
     task = fit.task
     if task.delay_std == 0.0 or any(isinstance(piece, Lag) for piece in fit.model.pieces):
@@ -157,13 +158,13 @@ def _by_delay(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
 
 
 def moved_in_common(other: ComponentFit, found: ComponentFit) -> FloatArray:
-    """By how much another law in one place moves the numbers that both models have, as `covariance` counts them."""
+    """Changes of the values that both models share with another law in one place, in the order of `covariance`."""
     there, here = _in_common(other, found.model), _in_common(found, found.model)
     return np.where(there == 0.0, 0.0, there - here)
 
 
 def _in_common(fit: ComponentFit, model: ComponentModel) -> FloatArray:
-    """The numbers of a fit that a model with another law, or another form of one, has too; 0 for its others."""
+    """Values of a fit that it shares with another model; 0 for the others of that model."""
     strengths, shapes = [], []
     for index, (one, other) in enumerate(zip(fit.model.pieces, model.pieces, strict=True)):
         same = one.effect == other.effect
@@ -175,13 +176,13 @@ def _in_common(fit: ComponentFit, model: ComponentModel) -> FloatArray:
 
 
 def _linear(fit: ComponentFit) -> FloatArray:
-    """Preload, k and c, as far as they are free."""
+    """Preload, k and c, if free."""
     free: FloatArray = np.array([fit.preload, fit.element.stiffness, fit.element.damping])[fit.task.linear[1]]
     return free
 
 
 def _numbers(fit: ComponentFit) -> FloatArray:
-    """Everything that is fitted, in the order of `covariance`."""
+    """All fitted values, in the order of `covariance`."""
     return np.concatenate([_linear(fit), fit.strengths, *(np.array(shape, dtype=float) for shape in fit.model.shapes)])
 
 
@@ -201,7 +202,7 @@ def _per_lag(fit: ComponentFit, lag: Lag, shape: Sequence[float]) -> FloatArray:
 
 
 def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations of a piece's law parameters and of what is quoted of it, by linear propagation."""
+    """Standard deviations of a piece's law parameters and quoted values, by linear propagation."""
     count = len(names)
     at = count + sum(len(p.signs) for p in fit.model.pieces[:index])
     own = list(range(at, at + len(fit.model.pieces[index].signs)))
@@ -224,7 +225,7 @@ def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) ->
         gradient = np.zeros((len(centre), len(start)))
         for j in range(len(start)):
             step = _RELATIVE * max(abs(start[j]), 1e-9)
-            with np.errstate(over="ignore", invalid="ignore"):  # what a huge exponent leaves open is infinite
+            with np.errstate(over="ignore", invalid="ignore"):  # huge exponents have infinite deviations
                 gradient[:, j] = (values(start + step * (np.arange(len(start)) == j), what) - centre) / step
         with np.errstate(over="ignore", invalid="ignore"):
             variance = np.diag(gradient @ block @ gradient.T) if len(centre) else centre

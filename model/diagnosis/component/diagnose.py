@@ -14,7 +14,7 @@ from sprung.model.diagnosis.component.judgement import Judged, concluded
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
 from sprung.model.diagnosis.component.piece import HYSTERESIS, SURFACE, Piece
 from sprung.model.diagnosis.component.pieces import PIECES
-from sprung.model.diagnosis.component.search import Progress as Told
+from sprung.model.diagnosis.component.search import Progress as PieceProgress
 from sprung.model.diagnosis.component.search import Ranked, Step, search
 from sprung.model.diagnosis.component.smooth import smooth_serves
 from sprung.model.diagnosis.investigation.state import Options, Progress, Recorded
@@ -25,36 +25,36 @@ from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.system import System
 
 _ONE_LOOP = (
-    "the test repeats one loop, which several laws together imitate whatever made it; "
+    "the test repeats one hysteresis loop, which several laws in combination can imitate whatever its origin; "
     "another amplitude or rate, or random motion, would tell them apart"
 )
 
 
-def diagnose_components(system: System, record: Recorded, options: Options, tell: Progress) -> Report:
+def diagnose_components(system: System, record: Recorded, options: Options, progress: Progress) -> Report:
     """Diagnose every component test of a system without bodies.
 
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
-    tell(0.05, "channels, motion and noise")
+    progress(0.05, "channels, motion and noise")
     pieces, own = pieces_of(system.catalogue)
     records = component_records(system, record.values, record.sample_rate, options.rules, own)
     judged = []
     for number, one in enumerate(records):
 
-        def progress(text: str, name: str = one.element, share: float = 0.1 + 0.8 * number / len(records)) -> None:
-            tell(share, f"{name}: {text}")
+        def of_component(text: str, name: str = one.element, share: float = 0.1 + 0.8 * number / len(records)) -> None:
+            progress(share, f"{name}: {text}")
 
-        judged.append(_judge(one, pieces, options.rules.verdict, progress))
-    tell(0.95, "report")
+        judged.append(_judge(one, pieces, options.rules.verdict, of_component))
+    progress(0.95, "report")
     report = compose_components(system, record, options, judged, concluded(judged, options.rules))
-    tell(1.0, "done")
+    progress(1.0, "done")
     return report
 
 
 def pieces_of(catalogue: Sequence[Law]) -> tuple[tuple[Piece, ...], tuple[Law, ...]]:
-    """The pieces of a catalogue's laws, and the laws that have none, of which `own` makes pieces where it can.
+    """Pieces of a catalogue's laws, and the laws without one, for `own` to make pieces of.
 
-    Of our own laws without a piece, those that do not act at an element or that are nuisances need none.
+    Bundled laws without a piece are nuisances or do not act at elements.
     """
     names = {law.name for law in catalogue}
     pieced = {law.name for piece in PIECES for law in (piece.law, piece.acting) if law is not None}
@@ -66,11 +66,11 @@ def _of_element(law: Law) -> bool:
     return isinstance(law, ElementLaw) and law.where == "element" and not law.nuisance
 
 
-def _judge(one: ComponentRecord, pieces: tuple[Piece, ...], rules: VerdictRules, tell: Told) -> Judged:
+def _judge(one: ComponentRecord, pieces: tuple[Piece, ...], rules: VerdictRules, progress: PieceProgress) -> Judged:
     turned = turned_round(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
-    found = search(one.task, (*pieces, *one.own), tell, one.given)
+    found = search(one.task, (*pieces, *one.own), progress, one.given)
     base, final = found.base, found.final
     judged = Judged(one, found, base, final, final.floor, turned)
     alone = _only_one_loop(judged)
@@ -83,19 +83,19 @@ def _judge(one: ComponentRecord, pieces: tuple[Piece, ...], rules: VerdictRules,
     least = _least(judged.found.steps, one.task.rules)
     carried = bool(judged.found.steps) and share is not None and share >= least
     if alone or (left and not carried) or smooth_serves(judged.final, len(one.given.pieces)):
-        tell("what is left, as a formula")
-        told = _with_formula(judged, rules)
-        if told is not None:
-            return told
-        tell("what is left, as an unnamed force")
+        progress("remaining force as a formula")
+        candidate = _with_formula(judged, rules)
+        if candidate is not None:
+            return candidate
+        progress("remaining force as an unnamed force")
         judged = replace(_with_surface(_closest(judged)), named=False)
     return judged
 
 
 def _only_one_loop(judged: Judged) -> bool:
-    """Whether a hysteresis beside other laws was seen along one loop alone, which such sums imitate whatever it is.
+    """Whether hysteresis beside other laws was observed along a single loop, which such sums can always imitate.
 
-    The held-out part, the same loop again, refutes none of them.
+    The held-out part repeats the same loop and cannot refute them.
     """
     task, found = judged.final.task, judged.found.steps
     if len(found) < 2 or task.signals or not any(step.chosen.last.kind is HYSTERESIS for step in found):
@@ -104,15 +104,15 @@ def _only_one_loop(judged: Judged) -> bool:
 
 
 def _least(steps: tuple[Step, ...], rules: ComponentRules) -> float:
-    """Share of the excess power that laws explain if they are the component's; several imitate much that is none."""
+    """Least share of the excess power that true laws explain; more for several laws, which are more flexible."""
     one = len(steps) < 2 and not any(isinstance(p, Piece) and p.imitates for p in (s.chosen.last for s in steps))
     return rules.named if one else 1 - rules.together
 
 
 def _established(judged: Judged, rules: VerdictRules) -> Judged:
-    """With the first law alone, where that is enough and several leave too much to be named.
+    """With the first law only, if it suffices and several laws leave too much to be named.
 
-    Where the first is not enough by itself, all stay, for what comes closest, and nothing is named.
+    If the first does not suffice, all are kept as the closest approximation, and none is named.
     """
     task, steps = judged.final.task, judged.found.steps
     share = judged.errors.explained(rules)
@@ -126,18 +126,18 @@ def _established(judged: Judged, rules: VerdictRules) -> Judged:
 
 
 def _with_formula(judged: Judged, rules: VerdictRules) -> Judged | None:
-    """The force that no law explains as a formula, where one explains as much as a law has to."""
+    """With a formula for the unexplained force, if one explains as much as a law must."""
     with np.errstate(all="ignore"):  # trial formulas overflow
         found = formula_search(judged.record.task, judged.record.given)
     if found is None:
         return None
-    told = replace(judged, found=found, final=found.final, floor=found.final.floor)
-    share = told.errors.explained(rules)
-    return told if share is not None and share >= judged.record.task.rules.named else None
+    candidate = replace(judged, found=found, final=found.final, floor=found.final.floor)
+    share = candidate.errors.explained(rules)
+    return candidate if share is not None and share >= judged.record.task.rules.named else None
 
 
 def _closest(judged: Judged) -> Judged:
-    """With the single law that predicts best, where it does so better than those that were not enough together."""
+    """With the single law that predicts best, if it predicts better than the insufficient combination."""
     task, found = judged.final.task, judged.found
     alone = [replace(ranked, fit=fitted(task, ranked.fit.model)) for ranked in found.alone]
     best = min(alone, key=lambda ranked: ranked.fit.held_out, default=None)
@@ -151,9 +151,9 @@ def _closest(judged: Judged) -> Judged:
 
 
 def _with_surface(judged: Judged) -> Judged:
-    """The rest as an unnamed force, if that serves the held-out part.
+    """With the remainder as an unnamed force, if that improves the held-out part.
 
-    Which law stands beside it is of no meaning: whatever predicts best.
+    The law beside it is chosen by prediction only and has no meaning.
     """
     task, before = judged.final.task, judged.final
     beside = [judged.final.model, *(ranked.fit.model for ranked in judged.found.alone)]

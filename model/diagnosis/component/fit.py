@@ -1,4 +1,4 @@
-"""A component's force fitted to a record: strengths by linear least squares, shapes around them."""
+"""Fits of a component's force to a record: variable projection with strengths as the linear values."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
 
 _STEPS = 40  # evaluations of a search for shapes
-_ENOUGH = 1e-6  # change of the squares, or of the shapes, at which it ends: far below any deviation
+_ENOUGH = 1e-6  # relative change of the sum of squares, or of the shapes, at convergence
 DIRECT = SensorResponse()
-_FORGETS = 5.0  # time constants after which a filter shows nothing of what was before
-_KEPT = 2_500_000  # samples of columns that a task remembers: rounds of trials and refinements ask for them again
+_FORGETS = 5.0  # time constants after which the initial state of a filter has decayed
+_KEPT = 2_500_000  # samples of columns in a task's cache
 
 
 @dataclass(frozen=True)
 class NominalValues:
-    """Spring and damper as the system file has them; None: free."""
+    """Spring and damper that the system file fixes; None: free."""
 
     stiffness: float | None  # N/m, if it is fixed
     damping: float | None  # N s/m, if it is fixed
@@ -42,25 +42,25 @@ class ComponentTask:
     split: int
     nominal: NominalValues = NominalValues(None, None)
     rules: ComponentRules = RULES.component
-    signals: tuple[Covariate, ...] = ()  # that its parameters may follow
-    noise: float = 0.0  # N, of the force as the record itself shows it, apart from any model
-    declared: float = 0.0  # N, the same as the system file states it; 0: it states none
-    held: tuple[PlacedLaw, ...] = ()  # laws whose values are known and not estimated
-    delay_std: float = 0.0  # s, between the force's channel and the motion's, as instruments leave it
-    lag: float = 0.0  # s, time constant of a first-order filter that the force passes in its channel
+    signals: tuple[Covariate, ...] = ()  # on which its parameters may depend
+    noise: float = 0.0  # N, of the force, estimated from the record without a model
+    declared: float = 0.0  # N, as stated in the system file; 0: not stated
+    held: tuple[PlacedLaw, ...] = ()  # laws with fixed values
+    delay_std: float = 0.0  # s, between the channels of force and motion, of the instruments
+    lag: float = 0.0  # s, time constant of a first-order filter of the force channel
 
     @cached_property
     def seen(self) -> Seen:
         return Seen.of(self.motion, self.rules)
 
     def through(self, channel: SensorResponse) -> ComponentTask:
-        """The same with what a late or slow channel shows of the modelled force."""
+        """The same with delay and filter of the force channel."""
         if channel == DIRECT:
             return self
         return replace(self, motion=self.motion.delayed(channel.delay), lag=self.lag + channel.lag)
 
     def columns_of(self, piece: Part, shape: tuple[float, ...]) -> FloatArray:
-        """Force per strength of a piece along the motion, (T, m); what was asked for lately is remembered."""
+        """Force per strength of a piece along the motion, (T, m); cached."""
         key = (id(piece), shape)
         if key not in self._columns:
             if len(self._columns) * len(self.force) > _KEPT:
@@ -69,16 +69,16 @@ class ComponentTask:
         return self._columns[key][1]
 
     def _shown(self, columns: FloatArray) -> FloatArray:
-        """What the channel shows of forces (T, m)."""
+        """Forces (T, m) as shown by the channel."""
         return passed(columns.T, SensorResponse(lag=self.lag), 1 / self.motion.step).T if self.lag else columns
 
     @cached_property
     def _columns(self) -> dict[tuple[int, tuple[float, ...]], tuple[Part, FloatArray]]:
-        return {}  # with the piece, so that its number is no other's
+        return {}  # holds the piece, so that its id stays unique
 
     @property
     def bounded_noise(self) -> float:
-        """The cell's noise, N: what the record shows, or was declared, up to a fiftieth of the force."""
+        """Noise of the load cell, N: as estimated from the record or declared, at most a fiftieth of the force."""
         return max(self.noise, min(self.declared, self.rules.declared * float(np.std(self.force))))
 
     def every(self, stride: int) -> ComponentTask:
@@ -89,7 +89,7 @@ class ComponentTask:
 
     @cached_property
     def linear(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Columns of preload, k and c that are free (T, m), which they are (3,), and the force without the others."""
+        """Columns (T, m) of preload, k and c that are free, a mask of these (3,), and the force less the fixed ones."""
         columns = np.column_stack([np.ones(len(self.force)), self.motion.deflection, self.motion.rate])
         known = np.array([0.0, self.nominal.stiffness or 0.0, self.nominal.damping or 0.0])
         free = np.array([True, self.nominal.stiffness is None, self.nominal.damping is None])
@@ -125,7 +125,7 @@ class ComponentModel:
         return ComponentModel(tuple(self.pieces[i] for i in keep), tuple(self.shapes[i] for i in keep))
 
     def replaced(self, index: int, piece: Part, shape: tuple[float, ...]) -> ComponentModel:
-        """With another law in one place."""
+        """With one law replaced."""
         return ComponentModel(
             (*self.pieces[:index], piece, *self.pieces[index + 1 :]),
             (*self.shapes[:index], shape, *self.shapes[index + 1 :]),
@@ -133,7 +133,7 @@ class ComponentModel:
 
     @property
     def channel(self) -> SensorResponse:
-        """What the force's channel makes of it against the motion's."""
+        """Delay and filter of the force channel relative to the motion."""
         for piece, shape in zip(self.pieces, self.shapes, strict=True):
             if isinstance(piece, Lag):
                 return piece.response(shape)
@@ -151,7 +151,7 @@ class ComponentModel:
 
     @property
     def count(self) -> int:
-        """Free numbers of the laws."""
+        """Number of free values of the laws."""
         return sum(len(p.signs) + len(p.shapes) for p in self.pieces)
 
 
@@ -186,7 +186,7 @@ class ComponentFit:
 
     @property
     def motion_noise(self) -> float:
-        """What spring and damper make of the motion's noise, N."""
+        """Noise of the motion through spring and damper, N."""
         motion = self.task.motion
         return float(
             np.hypot(self.element.stiffness * motion.deflection_noise, self.element.damping * motion.rate_noise)
@@ -194,26 +194,26 @@ class ComponentFit:
 
     @property
     def at_noise(self) -> bool:
-        """Whether nothing is left but noise that the record shows apart from any model: then no law is missing.
+        """Whether the residual is at the noise level estimated without a model: then no law is missing.
 
-        The noise of a differentiated motion lies in few bins, so that its chance patterns look like laws.
+        The noise of a differentiated motion lies in few bins, whose random patterns resemble laws.
         """
         level = self.task.rules.at_noise * (self.task.noise**2 + self.motion_noise**2)
         return max(self.error, self.held_out) < level
 
     @property
     def floor(self) -> float:
-        """Bounded noise of the force, N: the cell's, and that of the motion through spring and damper."""
+        """Noise floor of the force, N: bounded noise of the cell, and of the motion through spring and damper."""
         most = self.task.rules.declared * float(np.std(self.task.force))
         return float(np.hypot(self.task.bounded_noise, min(self.motion_noise, most)))
 
     @property
     def leaves_more(self) -> bool:
-        """Whether more than noise is left: then the model is not quite what is there."""
+        """Whether the residual exceeds the noise floor: the model is then not exact."""
         return max(self.error, self.held_out) > self.task.rules.above * self.floor**2
 
     def leaves_hardly_more(self, best: ComponentFit) -> bool:
-        """Whether hardly more power is left beyond noise than another model leaves, in either part."""
+        """Whether hardly more power beyond noise is left than by another model, in either part."""
         noise, most = best.floor**2, self.task.rules.hardly_more
         pairs = ((self.error, best.error), (self.held_out, best.held_out))
         return all(here - noise < most * (there - noise) for here, there in pairs)
@@ -229,7 +229,7 @@ class ComponentFit:
         return piece.values(self.strengths_of(index), self.model.shapes[index], self.element)
 
     def quoted(self, index: int) -> Values:
-        """What an engineer quotes of a piece."""
+        """Values of a piece that engineers quote, by name, with units."""
         piece = self.model.pieces[index]
         return piece.quoted(self.strengths_of(index), self.model.shapes[index], self.element)
 
@@ -256,7 +256,7 @@ def fitted(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     base, free, force = task.through(model.channel).linear
     columns = np.column_stack([base, model.columns(task)])
     late = model.channel.delay + _FORGETS * model.channel.lag
-    if late != 0.0:  # before the record nobody knows the motion
+    if late != 0.0:  # the motion before the record is unknown
         earlier = task.motion.time - late
         known = (earlier >= task.motion.time[0]) & (earlier <= task.motion.time[-1])
         columns, force = columns * known[:, None], force * known
@@ -271,7 +271,7 @@ def fitted(task: ComponentTask, model: ComponentModel) -> ComponentFit:
 
 
 def refined(task: ComponentTask, model: ComponentModel) -> ComponentFit:
-    """The best shapes near a model's, all pieces together."""
+    """The fit with shapes optimised jointly for all pieces, from a model's shapes."""
     start = np.array([value for shape in model.shapes for value in shape])
     if not len(start):
         return fitted(task, model)

@@ -1,7 +1,7 @@
-"""A component's force that no law explains as a formula: shapes of the grammar, alone and in pairs.
+"""Formula search for an unexplained force of a component: shapes of the grammar, single and in pairs.
 
-The same grammar as beside a vehicle (`model.laws.grammar`): along the measured motion every shape is a column with an
-amplitude, its own length, rate or time a shape to be searched.  Deflections count from the middle of the travel.
+Same grammar as for vehicles (`model.laws.grammar`).  Along the measured motion every shape is a column with an
+amplitude; its own length, rate or time is searched.  Deflections are relative to the middle of the travel.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from sprung.model.laws.grammar import forms, formula_cost, law_of
 from sprung.model.signals import FloatArray
 
 _UNIT = SpringDamper(1.0, 1.0)
-_OFF = 2.0  # factor by which an amplitude is tried for being one
+_OFF = 2.0  # factor to test whether a parameter is an amplitude
 
 
 @dataclass(frozen=True)
 class FormulaPiece(Piece):
-    """A formula as a part of a component's force."""
+    """A formula as a piece of a component's force."""
 
     parts: int = 0  # complexity
 
     @property
     def key(self) -> str:
-        """Apart from other formulas."""
+        """Distinguishes formulas."""
         return f"{EFFECT} {self.law.formula} {self.law.memory_formula}"
 
 
@@ -85,27 +85,33 @@ def given_piece(law: ElementLaw, values: Sequence[float]) -> FormulaPiece | None
 
 
 def formula_search(task: ComponentTask, given: ComponentModel) -> Search | None:
-    """A formula beside spring, damper and the laws that the file gives; None: none is more than chance.
+    """A formula beside spring, damper and the given laws; None if none is significant.
 
-    Two shapes together are tried of those that did best alone.
+    Pairs are made of the best single shapes.
     """
     rules = task.rules
     quick, fine = task.every(max(1, len(task.force) // rules.search)), task.every(max(1, len(task.force) // rules.fit))
     base, seen = refined(quick, given), _observed(task)
     single = {piece.key: (form, piece) for form in forms() for piece in [_single(form, seen)]}
-    alone = [one for one in next_laws(base, tuple(piece for _, piece in single.values()), rules) if _told(one, rules)]
-    alone.sort(key=_worth, reverse=True)
+    alone = [
+        one
+        for one in next_laws(base, tuple(piece for _, piece in single.values()), rules)
+        if _is_determined(one, rules)
+    ]
+    alone.sort(key=_net_evidence, reverse=True)
     pairs = [
         _pair(single[one.last.key][0], one.fit.model.shapes[-1], form, piece, task.seen)
         for one in alone[: rules.formula_partners]
         for key, (form, piece) in single.items()
         if key != one.last.key and not (form.memory and single[one.last.key][0].memory)
     ]
-    if not alone or _worth(alone[0]) <= 0:
+    if not alone or _net_evidence(alone[0]) <= 0:
         return None
     enough = rules.formula_pair * alone[0].fit.held_out
-    together = [one for one in next_laws(base, tuple(pairs), rules) if _told(one, rules) and one.fit.held_out < enough]
-    chosen, before = max([alone[0], *together], key=_worth), Ranked(base, 0.0, 0.0, 0.0)
+    together = [
+        one for one in next_laws(base, tuple(pairs), rules) if _is_determined(one, rules) and one.fit.held_out < enough
+    ]
+    chosen, before = max([alone[0], *together], key=_net_evidence), Ranked(base, 0.0, 0.0, 0.0)
     freedom = chosen.fit.model.count - base.model.count
     p_value = chance(chosen.gain, freedom, len(single))
     if p_value > rules.alpha or chosen.fit.held_out >= base.held_out:
@@ -116,8 +122,8 @@ def formula_search(task: ComponentTask, given: ComponentModel) -> Search | None:
     )
 
 
-def _worth(one: Ranked) -> float:
-    """Evidence less what the formula's parts cost."""
+def _net_evidence(one: Ranked) -> float:
+    """Evidence less the cost of the formula's complexity."""
     piece = one.last
     return one.evidence - formula_cost(piece.parts if isinstance(piece, FormulaPiece) else 0)
 
@@ -128,18 +134,18 @@ def _single(form: Form, seen: Observed) -> FormulaPiece:
 
 
 def _pair(one: Form, shape: Shape, other: Form, piece: FormulaPiece, seen: Seen) -> FormulaPiece:
-    """A shape at the values that it had alone, and another at any of its trial values."""
+    """A pair of a shape at its best values and another with all its trial values."""
     trials = piece.grid(seen)
     rows = np.column_stack([np.tile(np.array(shape, dtype=float), (len(trials), 1)), trials])
     return formula_piece(law_of((one, other)), rows, one.parts + other.parts)
 
 
-def _told(one: Ranked, rules: ComponentRules) -> bool:
-    """Whether the record tells every amplitude."""
+def _is_determined(one: Ranked, rules: ComponentRules) -> bool:
+    """Whether every amplitude is significant."""
     index = len(one.fit.model.pieces) - 1
     sigma, _ = spread(one.fit, index, *covariance(one.fit))
     named = zip(one.fit.values(index).items(), sigma, strict=True)
-    return all(abs(value) > rules.formula_told * s for (name, (value, _)), s in named if name in "abc")
+    return all(abs(value) > rules.formula_significant * s for (name, (value, _)), s in named if name in "abc")
 
 
 def _observed(task: ComponentTask) -> Observed:

@@ -1,4 +1,4 @@
-"""Laws between a component test and its system file: those that the file puts in place, and those to be written."""
+"""Laws of the system file in component tests, and identified laws to be written to it."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ from sprung.model.system import System
 def given_model(
     system: System, element: str, seen: Observed, notes: list[str]
 ) -> tuple[ComponentModel, tuple[PlacedLaw, ...]]:
-    """The laws of the system file at an element: with the shapes they have there, to be estimated anew; and those held.
+    """Laws of the system file at an element: a model of those to be estimated, and those with fixed values.
 
-    Laws are held all of whose values the file fixes.  seen: the element's motion.  notes: gets a line for every law
-    that is not as the file has it.
+    seen: sizes of the element's motion.  notes: a line is appended for every law that is not used as the file has it.
     """
     model, held = ComponentModel(), []
     for placed in system.laws:
-        if placed.location != element or (placed.law is PRELOAD and not all(placed.fixed)):  # every test has one
+        if placed.location != element or (placed.law is PRELOAD and not all(placed.fixed)):  # part of every model
             continue
         if all(placed.fixed) and isinstance(placed.law, ElementLaw):
             held.append(placed)
@@ -40,7 +39,7 @@ def given_model(
             )
         piece, shape = _piece(placed, seen)
         if piece is None:
-            notes.append(f"{element}: {placed.law.name} of the system file is left out: component tests do not fit it")
+            notes.append(f"{element}: {placed.law.name} of the system file is ignored: component tests cannot fit it")
             continue
         model = model.plus(piece, shape)
     return model, tuple(held)
@@ -62,10 +61,10 @@ def _piece(placed: PlacedLaw, seen: Observed) -> tuple[Piece | None, tuple[float
 def identified_laws(
     fit: ComponentFit, element: str, count: int, full: FloatArray, names: list[str], sign: float
 ) -> tuple[IdentifiedLaw, ...]:
-    """The first `count` laws of a fit and its preload as a system file has them.
+    """The first `count` laws of a fit and its preload, in the form of a system file.
 
-    full, names: covariance of the fit; sign: -1 where the measured force was turned.  What follows a measured signal
-    has no place in a system file and is left out.
+    full, names: covariance of the fit; sign: -1 if the measured force was inverted.  Dependences on measured signals
+    cannot be expressed in a system file and are omitted.
     """
     found = [_as_placed(held, element) for held in fit.task.held]
     for index, piece in enumerate(fit.model.pieces[:count]):

@@ -1,8 +1,8 @@
-"""Motion of a support whose acceleration alone is measured: integrated twice, down to where it stands out of the noise.
+"""Motion of a support from its acceleration alone: integrated twice above the lowest frequency of the test.
 
-Noise of variance N per bin becomes N / w^4 in the deflection, so what is below the lowest frequency of the test is not
-motion but wandering, and is cut off, of the force too: springs and dampers do not mind.  The ends, where the filter
-still remembers that nothing came before, are left out.
+Noise of variance N per bin becomes N / w^4 in the deflection, so that drift dominates at low frequencies.  Motion and
+force are high-pass filtered alike, which preserves their linear relation.  The transients of the filter at both ends
+are cut off.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from sprung.model.diagnosis.record.signals import white_noise
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.signals import FloatArray
 
-_RAMP = 0.6  # of the lowest frequency, from where the filter opens
+_RAMP = 0.6  # of the lowest frequency, start of the filter's transition
 
 
 @dataclass(frozen=True)
 class Integrated:
-    """Motion from an acceleration; not a number at the ends."""
+    """Motion from an acceleration; NaN at the ends."""
 
     displacement: FloatArray  # m, (T,)
     velocity: FloatArray  # m/s, (T,)
     displacement_noise: float  # m
     velocity_noise: float  # m/s
-    lowest: float  # Hz, below which the motion is not known
+    lowest: float  # Hz, edge of the filter
 
 
 def integrated(acceleration: FloatArray, sample_rate: float, rules: ComponentRules) -> Integrated | None:
-    """Motion from an acceleration (T,); None: it shows nothing but noise."""
+    """Motion from an acceleration (T,), m/s^2; None if it contains nothing but noise."""
     good = np.isfinite(acceleration)
     at = np.arange(len(acceleration))
     series = without_gaps(acceleration)
@@ -49,7 +49,7 @@ def integrated(acceleration: FloatArray, sample_rate: float, rules: ComponentRul
     if lowest is None:
         return None
     passed = _passed(frequency, lowest)
-    omega = 2 * np.pi * np.maximum(frequency, _RAMP * lowest)  # below nothing is passed
+    omega = 2 * np.pi * np.maximum(frequency, _RAMP * lowest)  # limits the gain in the stop band
     here = slice(len(series) - 1, 2 * len(series) - 1)
     velocity, displacement = (
         np.fft.irfft(spectrum * passed / (1j * omega) ** power, len(whole))[here] for power in (1, 2)
@@ -63,14 +63,14 @@ def integrated(acceleration: FloatArray, sample_rate: float, rules: ComponentRul
 
 
 def without_slow(series: FloatArray, sample_rate: float, lowest: float) -> FloatArray:
-    """A force (T,) without what is below the lowest frequency of its motion; gaps stay gaps."""
+    """A force (T,) filtered like a motion with the given lowest frequency, Hz; gaps are kept."""
     whole, frequency = _mirrored(without_gaps(series), sample_rate)
     fast = np.fft.irfft(np.fft.rfft(whole) * _passed(frequency, lowest), len(whole))
     return np.where(np.isfinite(series), fast[len(series) - 1 : 2 * len(series) - 1], np.nan)
 
 
 def _mirrored(series: FloatArray, sample_rate: float) -> tuple[FloatArray, FloatArray]:
-    """A series continued at both ends by its mirror image, and the frequencies of its spectrum, Hz."""
+    """A series extended by its mirror image at both ends, and the frequencies of its spectrum, Hz."""
     whole = np.concatenate([series[:0:-1], series, series[-2::-1]])
     return whole, np.asarray(np.fft.rfftfreq(len(whole), 1 / sample_rate), dtype=np.float64)
 
@@ -81,7 +81,7 @@ def _passed(frequency: FloatArray, lowest: float) -> FloatArray:
 
 
 def _lowest(power: FloatArray, frequency: FloatArray, clear: float, least: float) -> float | None:
-    """The lowest frequency, Hz, of the band whose power per bin stands clear of the noise."""
+    """The lowest frequency, Hz, of the band with power per bin well above the noise."""
     smooth = uniform_filter1d(median_filter(power, size=5), size=max(5, 2 * len(power) // 1000) | 1)
     out = np.flatnonzero((smooth > clear) & (frequency >= least))
     return float(frequency[out[0]]) if len(out) else None

@@ -1,4 +1,4 @@
-"""Component tests judged: errors on the held-out part and the verdict of all of them together."""
+"""Judgement of component tests: held-out errors, and the common verdict."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from sprung.model.signals import FloatArray
 
 @dataclass(frozen=True)
 class Judged:
-    """One component with everything that the report says of it."""
+    """One component with the results that are reported."""
 
     record: ComponentRecord
     found: Search
     base: ComponentFit
     final: ComponentFit
     floor: float  # N
-    reversed: bool  # the force or the motion was measured with the other sign
-    surface: Step | None = None  # what no law explains, as an unnamed force
-    named: bool = True  # the laws explain enough to be the component's; else they are what comes closest
+    reversed: bool  # whether force or motion has the wrong sign
+    surface: Step | None = None  # the unexplained force as an unnamed force
+    named: bool = True  # whether the laws explain enough to be named; else they are the closest approximation
 
     @property
     def size(self) -> float:
@@ -39,18 +39,18 @@ class Judged:
 
     @cached_property
     def by_chance(self) -> tuple[FloatArray, list[str]]:
-        """Covariance of what the final model has, by chance alone, and names."""
+        """Random part of the covariance of the final model, and names."""
         return covariance(self.final)
 
     @cached_property
     def covariance(self) -> tuple[FloatArray, list[str]]:
-        """Covariance of what the final model has, with what the record leaves open besides chance, and names."""
+        """Covariance of the final model, systematic errors included, and names."""
         full, names = self.by_chance
         return full + left_open(self.final, [one.moved for one in self.alike]), names
 
     @cached_property
     def alike(self) -> tuple[Alike, ...]:
-        """What the record does not tell from the laws that are named."""
+        """Look-alikes of the named laws."""
         return look_alikes(self.final, self.found.steps if self.named else (), len(self.record.given.pieces))
 
     @property
@@ -60,35 +60,35 @@ class Judged:
 
     @property
     def unnamed(self) -> Step | None:
-        """What stands for the force that no law explains."""
+        """The step that stands for the unexplained force; None if there is none."""
         first = None if self.named else next(iter(self.found.steps), None)
         return self.surface or first
 
 
 @dataclass(frozen=True)
 class ComponentJudgement:
-    """What the component tests of a recording come to, together."""
+    """Common result of the component tests of a recording."""
 
     errors: HeldOutErrors  # per force
     verdict: Verdict
-    explained: float | None  # share of the excess error, where anything but nuisances was found
+    explained: float | None  # share of the excess error; None without findings other than nuisances
     left: FloatArray  # unexplained share of every force's power
 
 
 def concluded(judged: Sequence[Judged], rules: Rules) -> ComponentJudgement:
-    """The verdict of all tests, by the rules of components."""
+    """The common verdict of all tests."""
     parts = [one.errors for one in judged]
     errors = HeldOutErrors(*(np.concatenate([getattr(e, key) for e in parts]) for key in ("before", "after", "floor")))
-    said = sorted((pair for one in judged for pair in _speaks(one)), key=lambda pair: pair[1])
+    kinds = sorted((pair for one in judged for pair in _speaks(one)), key=lambda pair: pair[1])
     deciding = replace(rules.verdict, carried=rules.component.named)
-    found = any(kind is not EffectKind.NUISANCE for kind, _ in said)
+    found = any(kind is not EffectKind.NUISANCE for kind, _ in kinds)
     explained = errors.explained(deciding) if found else None
-    verdict = verdict_of([kind for kind, _ in said], errors, deciding)
+    verdict = verdict_of([kind for kind, _ in kinds], errors, deciding)
     return ComponentJudgement(errors, verdict, explained, errors.unexplained(deciding))
 
 
 def _speaks(one: Judged) -> Iterator[tuple[EffectKind, float]]:
-    """What every finding speaks for and its evidence, the most negative first; a preload speaks for nothing."""
+    """Kinds of all findings with their delta BIC, most negative first; preloads are nuisances."""
     if one.reversed:
         yield kind_of(SIGN_REVERSED), -np.inf
     given = len(one.record.given.pieces)

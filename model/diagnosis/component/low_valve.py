@@ -1,7 +1,7 @@
-"""A friction that turns over a wide range of rates, and a valve that opens at low ones: often the same to a test.
+"""Friction with a wide transition and a valve that opens at low rates, which are often indistinguishable.
 
-Valves are not sought below usual rates, where they act as friction.  So a friction is held against such a valve here:
-where that fits as well, the test does not tell them apart.
+The search does not try valves with knees below usual rates, where they act like friction.  A friction that was found is
+therefore compared with such a valve here.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _KNEES = (0.9, 1.1, 1.3, 1.5, 1.7, 1.9, 2.2)  # over the rate at which tanh turn
 
 
 def low_valve(fit: ComponentFit, index: int) -> ComponentFit | None:
-    """With the best valve in place of the friction at `index` of a fit; None: none acts there, or it is no friction."""
+    """The fit with the best valve in place of the friction at `index`; None without a friction or a plausible valve."""
     piece, task = fit.model.pieces[index], fit.task
     rival = piece.at_low_rates if isinstance(piece, Piece) else None
     valve = next((other for other in PIECES if other.law is rival), None)

@@ -1,11 +1,12 @@
-"""Which parts of a system are component tests, and their signals: an element that only supports and ground hold.
+"""Detection of component tests and their signals: elements between supports and ground.
 
-Its motion is measured at both ends and its force by a cell, so that nothing has to be simulated.  A body that hardly
-moves under the measured force, such as the frame that a user invents to have one, is taken for ground.
+The motion is measured at both ends and the force by a load cell, so that no simulation is needed.  Bodies that hardly
+move under the measured force, such as the frame of a test bench, are treated as ground.
 """
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,28 +41,28 @@ class ComponentRecord:
     task: ComponentTask
     notes: tuple[str, ...]
     given: ComponentModel = NO_LAWS  # laws of the system file
-    own: tuple[Piece, ...] = ()  # laws of the user's that are searched
+    own: tuple[Piece, ...] = ()  # user-defined laws of the search
 
 
 @dataclass(frozen=True)
 class _Wandering:
-    """What integrations of a motion left in it."""
+    """Errors of integrated motions."""
 
     deflection: float = 0.0  # m, noise
     rate: float = 0.0  # m/s, noise
-    lowest: float = 0.0  # Hz, below which the motion is not known
+    lowest: float = 0.0  # Hz, edge of the high-pass filter
 
     def beside(self, other: _Wandering) -> _Wandering:
-        """Of a difference of two motions."""
+        """Errors of the difference of two motions."""
         noise = float(np.hypot(self.deflection, other.deflection)), float(np.hypot(self.rate, other.rate))
         return _Wandering(*noise, max(self.lowest, other.lowest))
 
 
 def is_component_test(system: System, values: FloatArray, rules: Rules = RULES) -> bool:
-    """Whether nothing has to be simulated: no bodies, or only ones that the measured forces hardly move.
+    """Whether no simulation is needed: there are no bodies, or the measured forces hardly move them.
 
-    values (T, C): a recording's columns.  A foundation that a user invents for a damper on a test bench is one: its
-    motion under the measured force, by its stiffness to ground and its mass, is nothing beside that of the rod.
+    values: (T, C), columns of a recording.  A foundation in the model of a test bench counts as ground if its motion
+    under the measured force, by its stiffness and mass, is negligible compared with that of the rod.
     """
     if not system.bodies:
         return True
@@ -71,22 +72,28 @@ def is_component_test(system: System, values: FloatArray, rules: Rules = RULES) 
     weighed = component_elements(system, set())
     if set(system.sensors) - set(weighed.values()) or not weighed:
         return False
-    moved = [
-        np.nanstd(values[:, names.index(f"{n}.displacement")])
-        for n in system.file.inputs
-        if f"{n}.displacement" in names
-    ]
+    moved = [_spread(values, names, f"{n}.displacement") for n in system.file.inputs if f"{n}.displacement" in names]
     if not moved or min(moved) == 0:
         return False
-    force = sum(float(np.nanstd(values[:, names.index(sensor)])) for sensor in weighed.values())
-    held: dict[str, float] = dict.fromkeys(system.bodies, 0.0)
+    force = sum(_spread(values, names, sensor) for sensor in weighed.values())
+    least = min(_stiffness_to_ground(system, weighed).values())
+    return least > 0 and force / least < rules.component.frame * min(moved)
+
+
+def _spread(values: FloatArray, names: list[str], name: str) -> float:
+    """Standard deviation of a channel."""
+    return float(np.nanstd(values[:, names.index(name)]))
+
+
+def _stiffness_to_ground(system: System, without: Container[str]) -> dict[str, float]:
+    """Stiffness, N/m, of the elements that hold every body to ground, except those named in `without`."""
+    held = dict.fromkeys(system.bodies, 0.0)
     for name, element in system.file.elements.items():
         ends = {element.upper, element.lower}
-        if name not in weighed and GROUND in ends:
+        if name not in without and GROUND in ends:
             for body in ends & held.keys():
                 held[body] += element.stiffness.value
-    least = min(held.values())
-    return least > 0 and force / least < rules.component.frame * float(min(moved))
+    return held
 
 
 def component_elements(system: System, held: set[str]) -> dict[str, str]:
@@ -109,8 +116,8 @@ def component_records(
 ) -> list[ComponentRecord]:
     """The component tests in a recording's columns (T, C), in the order of `system.channels`.
 
-    laws: that are searched beside those of the catalogue.
-    Errors: `DiagnosisError` when a channel is missing, `TooLittleError` when too little is left or nothing moves.
+    laws: searched beside those of the catalogue.
+    Errors: `DiagnosisError` for a missing channel, `TooLittleError` for too short or motionless recordings.
     """
     elements = component_elements(system, set())
     if not elements:
@@ -118,25 +125,77 @@ def component_records(
             "a system without bodies is a component test: it needs an element between a support and ground (or two "
             "supports) and a sensor {kind: force, element: ...} on it"
         )
-    names = [channel.name for channel in (*system.channels, *system.signals)]
-    return [_record(system, values, names, sample_rate, e, s, rules, laws) for e, s in elements.items()]
+    return [_record(system, values, sample_rate, e, s, rules, laws) for e, s in elements.items()]
 
 
 def _record(
     system: System,
     values: FloatArray,
-    names: list[str],
     sample_rate: float,
     element: str,
     sensor: str,
     rules: Rules,
     laws: tuple[Law, ...],
 ) -> ComponentRecord:
+    """One component test.  Errors: as `component_records`."""
     notes: list[str] = []
-    displacement, velocity, left = _deflection(system, element, values, names, sample_rate, rules.component, notes)
+    measured = _measured(system, values, sample_rate, element, sensor, rules, notes)
+    rests = still_stretches(measured.displacement, sample_rate, rules.component)
+    run = _between(rests, len(measured.force), rules.record.minimum_samples)
+    if run != slice(0, len(measured.force)):
+        notes.append(
+            f"{element} stands still before {run.start / sample_rate:.2f} s and after {run.stop / sample_rate:.2f} s: "
+            "cut out; the force's noise was measured there"
+        )
+    velocity = None if measured.velocity is None else measured.velocity[run]
+    begin = (measured.first + run.start) / sample_rate
+    motion = element_motion(measured.displacement[run], velocity, sample_rate, begin, rules.component)
+    stated = system.file.elements[element]
+    sizes = observed(motion, SpringDamper(stated.stiffness.value, stated.damping.value))
+    given, held = given_model(system, element, sizes, notes)
+    own = own_pieces(laws, element, sizes, notes)
+    force = measured.force[run]
+    task = ComponentTask(
+        motion=motion.with_noise(measured.errors.deflection, measured.errors.rate),
+        force=force,
+        split=int(rules.record.fitted * (run.stop - run.start)),
+        nominal=NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping"))),
+        rules=rules.component,
+        signals=covariates(system, values, sample_rate, element, notes),
+        noise=max(noise_at_rest(measured.force, rests) or 0.0, white_noise(force)),
+        declared=system.file.sensors[sensor].noise,
+        held=held,
+        delay_std=min(_delay_std(system, sensor), 1 / sample_rate),
+    )
+    return ComponentRecord(element, sensor, task, tuple(notes), given, own)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """The longest gap-free stretch of a component test."""
+
+    displacement: FloatArray  # m, (T,)
+    velocity: FloatArray | None  # m/s, (T,), if measured
+    force: FloatArray  # N, (T,)
+    errors: _Wandering  # of an integrated motion
+    first: int  # its first sample in the recording
+
+
+def _measured(
+    system: System,
+    values: FloatArray,
+    sample_rate: float,
+    element: str,
+    sensor: str,
+    rules: Rules,
+    notes: list[str],
+) -> _Measured:
+    """Motion and force of an element.  Errors: as `component_records`."""
+    names = [channel.name for channel in (*system.channels, *system.signals)]
+    displacement, velocity, errors = _deflection(system, element, values, names, sample_rate, rules.component, notes)
     force = _column(values, names, sensor)
-    if left.lowest > 0:
-        force = without_slow(force, sample_rate, left.lowest)
+    if errors.lowest > 0:
+        force = without_slow(force, sample_rate, errors.lowest)
     good = np.isfinite(displacement) & np.isfinite(force) & (True if velocity is None else np.isfinite(velocity))
     first, last = _longest(good, max(1, int(rules.record.gap * sample_rate)))
     if last - first < rules.record.minimum_samples:
@@ -146,43 +205,17 @@ def _record(
         )
     if last - first < len(values):
         notes.append(f"used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording")
-    part = slice(first, last)
-    d, f = without_gaps(displacement[part]), without_gaps(force[part])
-    v = None if velocity is None else without_gaps(velocity[part])
+    d, f = (without_gaps(series[first:last]) for series in (displacement, force))
+    v = None if velocity is None else without_gaps(velocity[first:last])
     if np.std(d) <= rules.component.moves * white_noise(d) or np.ptp(d) == 0:
         raise TooLittleError(f"too still to decide anything: {element} is not moved")
     if np.ptp(f) == 0:
-        raise DiagnosisError(f"sensor {sensor} is stuck: it repeats one value; nothing can be told without it")
-    rests = still_stretches(d, sample_rate, rules.component)
-    run = _between(rests, len(d), rules.record.minimum_samples)
-    if (run.start, run.stop) != (0, len(d)):
-        notes.append(
-            f"{element} stands still before {run.start / sample_rate:.2f} s and after {run.stop / sample_rate:.2f} s: "
-            "cut out; the force's noise was measured there"
-        )
-    begin = (first + run.start) / sample_rate
-    motion = element_motion(d[run], None if v is None else v[run], sample_rate, begin, rules.component)
-    stated = system.file.elements[element]
-    sizes = observed(motion, SpringDamper(stated.stiffness.value, stated.damping.value))
-    given, held = given_model(system, element, sizes, notes)
-    own = own_pieces(laws, element, sizes, notes)
-    task = ComponentTask(
-        motion=motion.with_noise(left.deflection, left.rate),
-        force=f[run],
-        split=int(rules.record.fitted * (run.stop - run.start)),
-        nominal=NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping"))),
-        rules=rules.component,
-        signals=covariates(system, values, sample_rate, element, notes),
-        noise=max(noise_at_rest(f, rests) or 0.0, white_noise(f[run])),
-        declared=system.file.sensors[sensor].noise,
-        held=held,
-        delay_std=min(_delay_std(system, sensor), 1 / sample_rate),
-    )
-    return ComponentRecord(element, sensor, task, tuple(notes), given, own)
+        raise DiagnosisError(f"sensor {sensor} is stuck: it repeats one value; the test cannot be evaluated without it")
+    return _Measured(d, v, f, errors, first)
 
 
 def _delay_std(system: System, sensor: str) -> float:
-    """Standard deviation of a channel's delay by its data sheet, s."""
+    """Standard deviation of a channel's delay in the data sheet, s."""
     names = [channel.name for channel in system.channels][-len(system.tolerances) :]
     return float(system.tolerances[names.index(sensor)].delay)
 
@@ -196,13 +229,13 @@ def _deflection(
     rules: ComponentRules,
     notes: list[str],
 ) -> tuple[FloatArray, FloatArray | None, _Wandering]:
-    """Motion of an element's upper end less that of its lower, (T,); its rate where both ends' are known."""
+    """Deflection of an element (T,), upper less lower end; its rate if known at both ends; errors of integration."""
     ends, count = system.file.elements[element], len(values)
     displacement, velocity, has_velocity, left = np.zeros(count), np.zeros(count), True, _Wandering()
     for end, sign in ((ends.upper, 1.0), (ends.lower, -1.0)):
         if end not in system.file.inputs:
             if end != GROUND:
-                notes.append(f"{end} hardly moves under the measured force: taken for ground")
+                notes.append(f"{end} hardly moves under the measured force and is treated as ground")
             continue
         moved, rate, more = _motion_of(system, end, values, names, sample_rate, rules, notes)
         left = left.beside(more)
@@ -213,7 +246,7 @@ def _deflection(
 
 
 def _between(rests: list[slice], count: int, least: int) -> slice:
-    """What lies between standstill at the two ends of `count` samples; all of them where that is too little."""
+    """The samples between standstill at both ends of `count` samples; all of them if too few are left."""
     start = rests[0].stop if rests and rests[0].start == 0 else 0
     stop = rests[-1].start if rests and rests[-1].stop == count else count
     return slice(start, stop) if stop - start >= least else slice(0, count)
@@ -228,7 +261,7 @@ def _motion_of(
     rules: ComponentRules,
     notes: list[str],
 ) -> tuple[FloatArray, FloatArray | None, _Wandering]:
-    """Displacement of a support (T,), its rate where known, and what integrations left in both."""
+    """Displacement of a support (T,), its rate if known, and errors of integration."""
     source, nothing = system.file.inputs[end], _Wandering()
     if not isinstance(source, SupportInput):
         raise DiagnosisError(f"input {end}: a component test needs its motion measured, not a force on it")
@@ -240,7 +273,7 @@ def _motion_of(
         return _integral(rate, sample_rate), rate, nothing
     moved = integrated(_column(values, names, f"{end}.acceleration"), sample_rate, rules)
     if moved is None:
-        raise TooLittleError(f"too still to decide anything: {end}.acceleration shows nothing but noise")
+        raise TooLittleError(f"too still to decide anything: {end}.acceleration contains nothing but noise")
     notes.append(
         f"{end}'s motion was integrated from its acceleration; below {moved.lowest:.2g} Hz it is not known, and "
         "nothing is said of the force there, nor of a preload"
@@ -251,7 +284,7 @@ def _motion_of(
 def covariates(
     system: System, values: FloatArray, sample_rate: float, element: str, notes: list[str]
 ) -> tuple[Covariate, ...]:
-    """The signals that an element may follow, as far as a recording (T, C) has them; `notes` tells which it lacks."""
+    """Signals on which an element may depend, if a recording (T, C) has them; `notes` lists the missing ones."""
     found = []
     first = len(system.channels)
     for index, channel in enumerate(system.signals):
@@ -260,16 +293,16 @@ def covariates(
         series = values[:, first + index] if first + index < values.shape[1] else np.full(len(values), np.nan)
         signal = Covariate.of(channel.name, channel.unit, series, sample_rate)
         if not np.isfinite(series).any():
-            notes.append(f"{channel.name} is not in this recording: nothing can be told to follow it")
+            notes.append(f"{channel.name} is not in this recording: dependence on it cannot be identified")
         elif signal is None:
-            notes.append(f"{channel.name} does not change in this recording: nothing can be told to follow it")
+            notes.append(f"{channel.name} does not change in this recording: dependence on it cannot be identified")
         else:
             found.append(signal)
     return tuple(found)
 
 
 def _fixed(system: System, element: str, quantity: str) -> float | None:
-    """The value that the file fixes; None: to be estimated."""
+    """The value fixed by the system file; None: to be estimated."""
     value = getattr(system.file.elements[element], quantity)
     free = quantity in system.file.estimate and not value.fixed
     return None if free else float(value.value)
@@ -283,7 +316,7 @@ def _column(values: FloatArray, names: list[str], name: str) -> FloatArray:
 
 
 def _integral(rate: FloatArray, sample_rate: float) -> FloatArray:
-    """A position from its rate, about its mean; gaps stay gaps."""
+    """A position by integration of its rate, without its mean; gaps are kept."""
     good = np.isfinite(rate)
     filled = without_gaps(rate)
     position = np.concatenate([[0.0], np.cumsum(0.5 * (filled[1:] + filled[:-1]))]) / sample_rate
@@ -291,7 +324,7 @@ def _integral(rate: FloatArray, sample_rate: float) -> FloatArray:
 
 
 def _longest(good: np.ndarray, gap: int) -> tuple[int, int]:
-    """The longest run of samples without a gap longer than `gap`."""
+    """The longest run of samples without a gap longer than `gap` samples."""
     at = np.flatnonzero(good)
     if not len(at):
         return 0, 0
@@ -302,9 +335,9 @@ def _longest(good: np.ndarray, gap: int) -> tuple[int, int]:
 
 
 def turned_round(task: ComponentTask) -> bool:
-    """Whether the component would feed energy into the rig, or push away from where it is: a wrong sign.
+    """Whether the force has the wrong sign: the component would have negative damping or stiffness.
 
-    Springs and dampers take the other sign with the force; a nominal value that the file fixes says nothing here.
+    Values that the system file fixes are not considered.
     """
     d = task.motion.deflection - np.mean(task.motion.deflection)
     columns = np.column_stack([np.ones(len(d)), d, task.motion.rate])[: task.split]

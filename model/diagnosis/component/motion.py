@@ -1,8 +1,8 @@
-"""Deflection and rate of an element from a measured displacement, with what their noise is known to be.
+"""Deflection and rate of an element from a measured displacement, with their noise levels.
 
-A displacement that has no velocity beside it is differentiated.  White noise of variance N per bin becomes w^2 N, so
-the spectrum is first cut to where the motion stands out (Wiener's filter H = 1 - N / P on a smoothed periodogram P),
-and what noise passes is reported: it is the errors-in-variables part of the force's noise floor.
+Without a measured velocity the displacement is differentiated, which turns white noise of variance N per bin into
+w^2 N.  A Wiener filter H = 1 - N / P on a smoothed periodogram P limits it; the noise that passes is the
+errors-in-variables part of the force's noise floor.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sprung.model.signals import FloatArray
 
 ComplexArray = NDArray[np.complexfloating]
 
-_FINER, _MOST = 4, 100_000  # steps per sample along which memories are followed, and all of them at most
+_FINER, _MOST = 4, 100_000  # steps per sample for laws with memory, and their number at most
 
 
 @dataclass(frozen=True)
@@ -31,16 +31,16 @@ class ElementMotion:
     time: FloatArray  # s since the start of the recording, (T,)
     deflection: FloatArray  # m, (T,)
     rate: FloatArray  # m/s, (T,)
-    deflection_noise: float  # m, what is left of the measurement's noise
+    deflection_noise: float  # m, remaining noise
     rate_noise: float  # m/s
-    dense: ElementMotion | None = None  # the same between samples, too
-    stride: int = 1  # of its samples per sample
+    dense: ElementMotion | None = None  # the same motion with values between the samples
+    stride: int = 1  # dense samples per sample
 
     @classmethod
     def of(
         cls, time: FloatArray, deflection: FloatArray, rate: FloatArray, deflection_noise: float, rate_noise: float
     ) -> ElementMotion:
-        """A motion with what it does between samples: it turns there, which a memory must not miss."""
+        """A motion with interpolated values, since laws with memory depend on reversals between samples."""
         finer = int(np.clip(_MOST // len(time), 1, _FINER))
         motion = cls(time, deflection, rate, deflection_noise, rate_noise)
         if finer == 1:
@@ -52,7 +52,7 @@ class ElementMotion:
 
     @property
     def followed(self) -> ElementMotion:
-        """The motion as a memory follows it, of which every `stride`-th sample is this one's."""
+        """The dense motion for laws with memory; every `stride`-th sample is one of this motion."""
         return self if self.dense is None else self.dense
 
     @property
@@ -61,11 +61,11 @@ class ElementMotion:
 
     @property
     def middle(self) -> float:
-        """The position half way between the ends of the travel, m."""
+        """The middle of the travel, m."""
         return 0.5 * float(self.deflection.max() + self.deflection.min())
 
     def repeats(self, rules: ComponentRules = RULES.component) -> bool:
-        """Whether it is one cycle again and again: of one travel and one duration, as of a sine test."""
+        """Whether all cycles have the same travel and duration, as in a sine test."""
         at = turning_points(self.deflection, rules.turn * float(np.ptp(self.deflection)))
         if len(at) < rules.cycles:
             return False
@@ -74,12 +74,12 @@ class ElementMotion:
         return bool(np.all(high - low < rules.one_cycle * middle))
 
     def with_noise(self, deflection: float, rate: float) -> ElementMotion:
-        """With noise of other origin, m and m/s, beside its own."""
+        """With additional independent noise levels, m and m/s."""
         noise = float(np.hypot(self.deflection_noise, deflection)), float(np.hypot(self.rate_noise, rate))
         return replace(self, deflection_noise=noise[0], rate_noise=noise[1])
 
     def delayed(self, late: float) -> ElementMotion:
-        """The motion that long ago, s, between samples by cubic splines; at the ends it rests."""
+        """The motion delayed by `late`, s, interpolated by cubic splines; constant beyond the ends."""
         if late == 0.0:
             return self
         earlier = self._between(np.clip(self.time - late, self.time[0], self.time[-1]))
@@ -91,10 +91,12 @@ class ElementMotion:
         return CubicSpline(self.time, np.column_stack([self.deflection, self.rate]))
 
     def noisier(self, seed: int = 0) -> ElementMotion:
-        """The motion with as much noise again as it is known to have, at low frequencies alone as that is."""
+        """The motion with added noise of its own level and band."""
         if self.deflection_noise <= 0 or self.rate_noise <= 0:
             return self
-        fastest = np.sqrt(3.0) * self.rate_noise / self.deflection_noise  # of a flat spectrum with these deviations
+        fastest = (
+            np.sqrt(3.0) * self.rate_noise / self.deflection_noise
+        )  # rad/s, edge of a white spectrum with these deviations
         count = len(self.time)
         omega = 2 * np.pi * np.fft.rfftfreq(count, self.step)
         low = np.fft.rfft(np.random.default_rng(seed).standard_normal(count)) * ((omega > 0) & (omega <= fastest))
@@ -112,11 +114,11 @@ class ElementMotion:
         )
 
     def undersampled(self) -> ElementMotion:
-        """The motion as these samples alone tell it."""
+        """The motion interpolated from these samples only."""
         return ElementMotion.of(self.time, self.deflection, self.rate, self.deflection_noise, self.rate_noise)
 
     def every(self, stride: int) -> ElementMotion:
-        """Every so many samples; memories follow it in steps of half of that."""
+        """Every `stride`-th sample; laws with memory use steps of half of that."""
         if stride == 1:
             return self
         between = stride * self.stride
@@ -146,7 +148,7 @@ def turning_points(series: FloatArray, least: float) -> NDArray[np.intp]:
         elif moved * way > 0 or (way == 0 and abs(moved) > least):
             way = 1 if moved > 0 else -1
             if len(found) > 1:
-                found[-1] = at  # further on in the same way
+                found[-1] = at  # continues in the same direction
             else:
                 found.append(at)
         elif way and -moved * way > least:
@@ -178,7 +180,7 @@ def still_stretches(series: FloatArray, sample_rate: float, rules: ComponentRule
 
 
 def noise_at_rest(series: FloatArray, stretches: list[slice]) -> float | None:
-    """Standard deviation about a line over the stretches of standstill; None where there are none."""
+    """Standard deviation about a line over the stretches of standstill; None without any."""
     squares, count = 0.0, 0
     for stretch in stretches:
         values = series[stretch]
@@ -226,9 +228,9 @@ def _line(series: FloatArray, sample_rate: float, count: int, slope: float) -> F
 
 
 def _continued(series: FloatArray, sample_rate: float, odd: bool = True) -> tuple[ComplexArray, FloatArray, float]:
-    """Spectrum of a series continued at both ends without a jump, three times as long; w; the slope taken out.
+    """Spectrum of a series extended at both ends to three times its length; w, rad/s; and the slope removed.
 
-    Positions are continued as odd functions about their ends, so that their slope goes on; rates as even ones.
+    Positions are extended as odd functions about their ends, which preserves the slope; rates as even ones.
     """
     count = len(series)
     slope = float(series[-1] - series[0]) / ((count - 1) / sample_rate) if odd else 0.0
@@ -241,7 +243,7 @@ def _continued(series: FloatArray, sample_rate: float, odd: bool = True) -> tupl
 
 
 def _wiener(spectrum: ComplexArray, noise: float, stands_out: float) -> FloatArray:
-    """Filter that passes what stands out of white noise by a ratio, up to the highest such frequency."""
+    """Wiener filter up to the highest frequency at which the power exceeds the noise by a ratio."""
     count = 2 * (len(spectrum) - 1)
     power = np.abs(spectrum) ** 2 / max(count, 1)
     reach = max(5, count // 400) | 1

@@ -1,8 +1,8 @@
-"""Laws without a piece of their own in `pieces`, as a user's are: strength, shapes and trials by what the law states.
+"""Pieces for laws that have none in `pieces`, such as user-defined ones, derived from the law's declaration.
 
-A force that is linear in one parameter has that as its strength, and the others as shapes.  One that is linear in none
-gets a strength that has to come out as 1.  A force may be in proportion to the element's spring or damper, which are
-estimated beside it; what depends on both otherwise is no sum of columns.
+If the force is linear in one parameter, that is its strength, and the others are shapes.  Otherwise a strength is added
+that must result as 1.  The force may be proportional to the element's spring or damper, which are estimated beside it;
+laws that depend on both otherwise cannot be expressed as a sum of columns.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from sprung.model.signals import FloatArray
 _UNIT = SpringDamper(1.0, 1.0)
 _TINY = 1e-300
 
-Scale = Callable[[SpringDamper], float]  # N per strength that a force is in proportion to
+Scale = Callable[[SpringDamper], float]  # N per strength, factor of a proportional force
 
 
 def observed(motion: ElementMotion, element: SpringDamper) -> Observed:
-    """Sizes of a component's motion as laws ask for them."""
+    """Sizes of a component's motion, in the form that laws expect."""
     d = motion.deflection - motion.middle
     return observe(d, motion.rate, 1 / motion.step, element.stiffness, element.damping)
 
 
 def own_pieces(laws: Sequence[Law], element: str, seen: Observed, notes: list[str]) -> tuple[Piece, ...]:
-    """Pieces of the laws that can act at an element and be searched; notes: gets a line that names the others."""
+    """Pieces of the laws that can be searched at an element; notes: a line that names the others is appended."""
     pieces, others = [], []
     for law in laws:
         if isinstance(law, ElementLaw) and law.at and element not in law.at:
@@ -48,7 +48,7 @@ def own_pieces(laws: Sequence[Law], element: str, seen: Observed, notes: list[st
 
 
 def own_piece(law: ElementLaw, seen: Observed) -> Piece | None:
-    """A law as a part of a component's force; None: its force is no sum of columns."""
+    """A law as a piece of a component's force; None if its force is not a sum of columns."""
     trials = np.atleast_2d(np.asarray(law.shapes(seen), dtype=float))
     scale = None if trials.shape[1:] != (len(law.parameters),) or not len(trials) else _scale(law, trials[0], seen)
     if scale is None:
@@ -87,7 +87,7 @@ def own_piece(law: ElementLaw, seen: Observed) -> Piece | None:
 
 
 def _limits(law: ElementLaw, index: int, seen: Observed, reach: float) -> tuple[float, float]:
-    """Between which a shape is searched: what is admissible, `reach` times the usual size either way."""
+    """Search range of a shape: admissible, and within a factor `reach` of the typical size."""
     spec = law.parameters[index]
     size = abs(float(spec.typical(seen)))
     if not np.isfinite(size) or size == 0.0:
@@ -98,15 +98,15 @@ def _limits(law: ElementLaw, index: int, seen: Observed, reach: float) -> tuple[
 
 
 def _sign(law: ElementLaw, index: int) -> int:
-    """Which way its strength may go from where the law is absent: 1, -1, 0 for either."""
+    """Admissible sign of the strength: 1, -1, or 0 for either."""
     spec, zero = law.parameters[index], law.absent[index]
     return int(spec.low >= zero) - int(spec.high <= zero)
 
 
 def _scale(law: ElementLaw, values: FloatArray, seen: Observed) -> Scale | None:
-    """What the force is in proportion to, besides its strength; None: not linear in that, or in both of the element.
+    """Factor of the force beside its strength; None if not linear in it, or dependent on both values of the element.
 
-    Tried along two swings of the size that was observed.
+    Tested along two oscillations of the observed size.
     """
     swing = np.linspace(0.0, 4 * np.pi, 81)
     d, v = seen.deflection_rms * np.sqrt(2) * np.sin(swing), seen.rate_rms * np.sqrt(2) * np.cos(swing)

@@ -1,9 +1,9 @@
-"""What a component's force may be made of: a law that is linear in its strengths once few shapes are fixed.
+"""Pieces of a component's force: laws that are linear in their strengths at given shapes.
 
     F(t) = preload + k d + c v + sum over pieces of  strengths @ columns(motion; shapes)
 
-The strengths and k, c, preload follow by linear least squares for any shapes (variable projection, Golub and Pereyra
-1973), so that only one to three shapes per law are searched, on a grid first: no start can be far away.
+Strengths, k, c and preload follow by linear least squares for given shapes (variable projection, Golub and Pereyra
+1973), so that only one to three shapes per law are searched, initially on a grid.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ _MEDIAN_OF_NORMAL = 0.6745  # of the magnitude, over the deviation
 
 @dataclass(frozen=True)
 class Seen:
-    """Sizes of a motion: where knees, gaps and yield displacements can be sought."""
+    """Sizes of a motion, which bound knees, gaps and yield displacements."""
 
     travel: float  # m, half of the range
     rate: FloatArray  # m/s, quantiles 0 .. 100 % of the magnitude, (101,)
     seconds: float
     step: float  # s
-    lowest_knee: float  # m/s: a valve that opens far below usual rates acts as friction, and is called so
-    reach: float  # times the usual size of a length or rate, either way, within which a formula's are searched
-    latest: float  # s, that a channel may be late
+    lowest_knee: float  # m/s, of valves; with lower knees they act like friction
+    reach: float  # factor about the typical size, search range of a formula's lengths and rates
+    latest: float  # s, of the delay of a channel
 
     @classmethod
     def of(cls, motion: ElementMotion, rules: ComponentRules = RULES.component) -> Seen:
         quantiles = np.quantile(np.abs(motion.rate), np.linspace(0, 1, 101))
         travel = 0.5 * float(np.ptp(motion.deflection))
         rate, seconds = np.maximum(quantiles, 1e-12), len(motion.time) * motion.step
-        usual = max(float(rate[50]), _MEDIAN_OF_NORMAL * float(np.sqrt(np.mean(rate**2))))  # whatever rests there are
+        usual = max(float(rate[50]), _MEDIAN_OF_NORMAL * float(np.sqrt(np.mean(rate**2))))  # independent of rests
         knee = rules.lowest_knee * usual
         return cls(max(travel, 1e-12), rate, seconds, motion.step, knee, rules.formula_reach, rules.latest)
 
@@ -58,20 +58,20 @@ class Seen:
         return float(np.sqrt(np.mean(self.rate**2)))
 
     def slowest_corner(self, motion: ElementMotion) -> float:
-        """The rate that one sample passes at a reversal, m/s: a knee below it is not resolved."""
+        """Change of the rate per sample at a reversal, m/s: knees below it are not resolved."""
         return reversal_step(motion.rate)
 
 
 @dataclass(frozen=True)
 class FittedPiece:
-    """What a piece came to in a fit, for the question whether it can be so."""
+    """Values of a fitted piece, for the test of their plausibility."""
 
     values: Mapping[str, float]  # of the law's parameters
     strengths: FloatArray
     shape: Shape
     element: SpringDamper
     deflection: FloatArray  # m, (T,)
-    corner: float  # the rate that one sample passes at a reversal, m/s: a knee below it is not resolved
+    corner: float  # m/s, change of the rate per sample at a reversal: knees below it are not resolved
     rules: ComponentRules
     step: float  # s, between samples
     seconds: float  # of the record
@@ -79,10 +79,10 @@ class FittedPiece:
 
 @dataclass(frozen=True)
 class PieceKind:
-    """Pieces that do much the same."""
+    """A group of similar pieces."""
 
     name: str
-    dissipates: bool  # its force over deflection is a loop whatever the rate; of such a kind one is enough
+    dissipates: bool  # rate-independent hysteresis; at most one of a kind is used
 
 
 STATIC = PieceKind("static", dissipates=False)
@@ -97,27 +97,27 @@ Named = Callable[[FloatArray, Shape, SpringDamper], Values]
 
 @dataclass(frozen=True)
 class Piece:
-    """One law as a part of a component's force."""
+    """One law as a piece of a component's force."""
 
     law: ElementLaw
-    shapes: tuple[str, ...]  # names of what the columns depend on
+    shapes: tuple[str, ...]  # names of the nonlinear values
     grid: Callable[[Seen], FloatArray]  # trial shapes, (trials, shapes)
     limits: Callable[[Seen], list[tuple[float, float]]]  # of every shape
     signs: tuple[int, ...]  # of the strengths: 1, -1, 0 for either
-    parameters: Parameters  # the law's, of strengths, shapes and the element; its force is linear in the strengths
-    shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # shapes of the law's parameters
+    parameters: Parameters  # of the law, by strengths, shapes and element; linear in the strengths
+    shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # by the law's parameters
     quoted: Named = lambda a, s, e: {}
-    kind: PieceKind = STATIC  # look-alikes within a kind are told apart last
-    plain: int = 0  # prior cost: how many commoner laws it contains
-    acting: ElementLaw | None = None  # law of the columns, where that is another than the one that is named
+    kind: PieceKind = STATIC  # look-alikes are mostly of one kind
+    plain: int = 0  # prior cost: number of commoner laws it contains
+    acting: ElementLaw | None = None  # law of the columns, if not the named one
     acting_parameters: Parameters | None = None
-    believed: Believed = lambda fitted: True  # whether the record can have shown these values
-    imitates: bool = False  # much that is none: it has to leave as little as several laws together
-    at_low_rates: ElementLaw | None = None  # law that is not sought at low rates, since it acts as this one does there
+    believed: Believed = lambda fitted: True  # whether values are plausible for the record
+    imitates: bool = False  # so flexible that it must leave as little as several laws
+    at_low_rates: ElementLaw | None = None  # law that it is equivalent to at low rates
 
     @property
     def dissipates(self) -> bool:
-        """Whether its force over deflection is a loop whatever the rate."""
+        """Whether its force is a rate-independent hysteresis."""
         return self.kind.dissipates
 
     @property
@@ -126,7 +126,7 @@ class Piece:
 
     @property
     def speaks_for(self) -> EffectKind:
-        """What finding it says."""
+        """The kind of finding that it is."""
         return kind_of(self.law)
 
     @property
@@ -135,11 +135,11 @@ class Piece:
 
     @property
     def key(self) -> str:
-        """Apart from other pieces of the same law."""
+        """Distinguishes pieces of the same law."""
         return f"{self.law.name} {len(self.law.parameters)}"
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
-        """Force per strength along a motion, (T, m); deflections count from the middle of the travel."""
+        """Force per strength along a motion, (T, m); deflections relative to the middle of the travel."""
         law, of = self.acting or self.law, self.acting_parameters or self.parameters
         follows = self.kind is HYSTERESIS and law.path is not None
         along, stride = (motion.followed, motion.stride) if follows else (motion, 1)
@@ -160,7 +160,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Following:
-    """A law whose strengths follow a measured signal linearly, about its mean."""
+    """A law whose strengths depend linearly on a measured signal, about its mean."""
 
     piece: Piece
     signal: Covariate
@@ -280,12 +280,12 @@ class SliderSurface:
 
 @dataclass(frozen=True)
 class Lag:
-    """The force's channel late against the motion's: no force of its own, every other one is seen later.
+    """Lag of the force channel relative to the motion: not a force, but a change of how all forces are shown.
 
-    By a delay of its node, or by a filter of first order, which takes off from what is fast, too.
+    A pure delay of the node, or a first-order filter, which also attenuates high frequencies.
     """
 
-    filters: bool = False  # whether its time is a filter's constant
+    filters: bool = False  # whether its time is the time constant of a filter
     effect: str = SENSOR_LAG.name
     speaks_for: EffectKind = EffectKind.FAULT
     title: str = SENSOR_LAG.title
@@ -300,11 +300,11 @@ class Lag:
 
     @property
     def key(self) -> str:
-        """Apart from the other kind."""
+        """Distinguishes delay and filter."""
         return f"{self.effect} of a filter" if self.filters else self.effect
 
     def response(self, shape: Shape) -> SensorResponse:
-        """What the channel makes of a force."""
+        """Delay and filter of the channel."""
         return SensorResponse(lag=shape[0]) if self.filters else SensorResponse(delay=shape[0])
 
     def grid(self, seen: Seen) -> FloatArray:
@@ -325,15 +325,15 @@ class Lag:
 
 
 _REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
-_RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
+_RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate, knots of a force over it
 SURFACE = SliderSurface()
 LAGS = (Lag(), Lag(filters=True))
-LawPiece = Piece | Following | Lag  # what is searched among
+LawPiece = Piece | Following | Lag  # candidates of the search
 Part = LawPiece | SliderSurface
 
 
 def no_shapes(seen: Seen) -> FloatArray:
-    """The grid of a piece whose columns depend on nothing."""
+    """The grid of a piece without shapes."""
     return np.zeros((1, 0))
 
 

@@ -1,6 +1,6 @@
-"""The laws of the catalogue as pieces of a component's force: their strengths, shapes, and where shapes are sought.
+"""The laws of the catalogue as pieces of a component's force: strengths, shapes, and their search ranges.
 
-What a law is stands in `model.laws`; here it is said which of its numbers are strengths and which are shapes.
+The laws themselves are defined in `model.laws`.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS, P
 from sprung.model.laws.viscoelastic import FRACTIONAL_STIFFNESS
 from sprung.model.signals import FloatArray
 
-_SHARPEST = 1e-6  # an exponent this close to 1 is 1
-_POLYTROPIC = 1.3  # of a gas: no test of usual rates tells it from the column's length
+_SHARPEST = 1e-6  # distance of an exponent from 1 below which it is 1
+_POLYTROPIC = 1.3  # of a gas; not identifiable beside the column's length at usual rates
 
 
 def _yields(seen: Seen) -> FloatArray:
@@ -43,7 +43,7 @@ def _yields(seen: Seen) -> FloatArray:
 
 
 def _yield_limits(seen: Seen) -> tuple[float, float]:
-    return (2e-4 * seen.travel, 0.8 * seen.travel)  # beyond it nothing yields: a spring that softens
+    return (2e-4 * seen.travel, 0.8 * seen.travel)  # a larger yield displacement is a softening spring
 
 
 def _knee_limits(seen: Seen) -> tuple[float, float]:
@@ -59,7 +59,7 @@ def _apart_from_zero(value: float) -> float:
 
 
 def _opens_late_enough(fitted: FittedPiece) -> bool:
-    """A valve: less force beyond the knee, and knees that the sampling resolves."""
+    """A plausible valve: lower slope beyond the knee, and knees that the sampling resolves."""
     ratios = [fitted.values[name] for name in ("ratio", "ratio_compression") if name in fitted.values]
     knees = [fitted.values[name] for name in ("knee", "knee_compression") if name in fitted.values]
     least, most = fitted.rules.valve_least, fitted.rules.valve_most
@@ -67,7 +67,7 @@ def _opens_late_enough(fitted: FittedPiece) -> bool:
 
 
 def _falls(fitted: FittedPiece) -> bool:
-    """Friction that is told to fall with the rate has been above what it falls to, by a part of what is told."""
+    """Whether the fall of a friction with the rate was observed to a sufficient part."""
     force, static = fitted.values["force"], fitted.values["static_force"]
     fall, smoothing = fitted.values["stribeck_rate"], fitted.values["smoothing"]
     rate = fall * np.linspace(0.0, 3.0, 301)
@@ -76,30 +76,30 @@ def _falls(fitted: FittedPiece) -> bool:
 
 
 def _slips(fitted: FittedPiece) -> bool:
-    """What never slips is a spring with a gap."""
+    """Whether it slips at all; otherwise it is a spring with a gap."""
     gap, reach = fitted.shape
     u = np.abs(stop_path(fitted.deflection, 0.5 * gap + reach))
     return bool(np.mean(u > 0.999 * (0.5 * gap + reach)) > fitted.rules.slips)
 
 
 def _loose_within(fitted: FittedPiece) -> bool:
-    """No force in the gap."""
+    """Whether the spring keeps no force within the gap."""
     return bool(abs(fitted.strengths[0] / max(fitted.element.stiffness, 1e-300) - 1) < fitted.rules.lost)
 
 
 def _held_within(fitted: FittedPiece) -> bool:
-    """With no force before it, a stop is the spring, and has a clearance."""
+    """Whether there is a force before the stop; otherwise it is a spring with clearance."""
     return bool(fitted.element.stiffness > fitted.rules.lost * np.max(fitted.strengths))
 
 
 def _softest_within(fitted: FittedPiece) -> bool:
-    """A spring with its softest point, -k2 / (3 k3), in the travel: farther off, it is no such spring."""
+    """Whether the softest point, -k2 / (3 k3), lies within the travel."""
     travel = 0.5 * float(np.ptp(fitted.deflection))
     return bool(abs(fitted.values["k2"]) < 3 * abs(fitted.values["k3"]) * travel)
 
 
 def _stops(fitted: FittedPiece) -> bool:
-    """A stop of two sides, where it is touched deepest, is no softer than a part of the spring: else it mends that."""
+    """Whether a two-sided stop is stiff where it is compressed most; a soft one corrects the spring."""
     middle = 0.5 * (fitted.deflection.max() + fitted.deflection.min())
     d = fitted.deflection - middle
     depths = np.maximum([d.max() - fitted.shape[0], -d.min() - fitted.shape[1]], 0.0)
@@ -173,7 +173,7 @@ _LUGRE = Piece(
 
 
 def _loop(a: FloatArray, s: Shape, e: SpringDamper) -> tuple[float, ...]:
-    """Of the Bouc-Wen law: strength and shapes are yield force, yield displacement, exponent and gamma."""
+    """Parameters of the Bouc-Wen law from yield force (strength), yield displacement, exponent and gamma (shapes)."""
     n = 1.0 if s[1] < 1 + _SHARPEST else s[1]
     gamma = s[2] if len(s) > 2 else GAMMA
     return (a[0] / s[0], 1 / ((1 + gamma) * s[0] ** n), n, *s[2:])
@@ -221,7 +221,7 @@ _PINCHED = Piece(
 
 
 def _inner(a: FloatArray, s: Shape) -> float:
-    """What still holds within the gap, N/m."""
+    """Stiffness within the gap, N/m."""
     return float(a[1] / (0.5 * s[0] + s[1]))
 
 

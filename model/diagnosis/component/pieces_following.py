@@ -1,4 +1,4 @@
-"""Spring, damper and laws of a component that follow a measured signal: a current, a temperature."""
+"""Spring, damper and laws of a component that depend on a measured signal, such as a current or a temperature."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _STRENGTHENED = (COULOMB_FRICTION, BOUC_WEN, FRICTION_BACKLASH.wider, QUADRATIC_
 
 
 def pieces_following(signal: Covariate) -> tuple[LawPiece, ...]:
-    """Spring, damper and laws as they may follow a signal."""
+    """Pieces for the dependence of spring, damper and laws on a signal."""
 
     def linear(quantity: str) -> Piece:
         return Piece(

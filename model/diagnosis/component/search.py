@@ -1,8 +1,8 @@
-"""Which laws a component needs besides spring, damper and preload: one after the other, by evidence.
+"""Forward selection of a component's laws beside spring, damper and preload, by evidence.
 
 The evidence of a model is its gain over the linear one, n log(mean square before / after), less log n per parameter
-(BIC) and what a search among many laws costs, with n the effective number of independent numbers in the residual: a
-test by one sine repeats itself, and a thousand repetitions of one error tell no more about it than one.
+(BIC) and the cost of searching many laws.  n is the effective number of independent values in the residual, since the
+errors of a sine test repeat with every cycle.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Ranked:
-    """A model with what it is worth against the linear one."""
+    """A model with its evidence over the linear one."""
 
     fit: ComponentFit
     gain: float
@@ -62,36 +62,36 @@ class Step:
 
     @property
     def delta_bic(self) -> float:
-        """Of the chosen law, against the model without it."""
+        """BIC of the chosen law over the model without it."""
         last = self.chosen.last
         return bic(self.gain, len(last.signs) + len(last.shapes), int(self.chosen.count))
 
     def rival_bic(self, rival: Ranked) -> float:
-        """Of another law in its place."""
+        """BIC of another law in its place."""
         return bic(rival.gain, rival.fit.model.count - self.before.fit.model.count, int(rival.count))
 
 
 @dataclass(frozen=True)
 class Search:
-    """What was found."""
+    """Result of a search."""
 
     base: ComponentFit
     final: ComponentFit
     steps: tuple[Step, ...]
     screened: dict[str, float]  # law -> gain of its best trial alone, as screened
     alone: tuple[Ranked, ...] = ()  # models with one law, best first, named or not
-    tests: int = 1  # that a chance find could have passed
+    tests: int = 1  # number of tests, for the correction of p-values
 
 
 def search(
     task: ComponentTask,
     pieces: tuple[LawPiece, ...] = PIECES,
-    tell: Progress = lambda text: None,
+    progress: Progress = lambda text: None,
     given: ComponentModel = NO_LAWS,
 ) -> Search:
-    """Grow a model of the component until the rest is noise, or nothing explains enough of it.
+    """Add laws until the residual is noise, or no law explains enough of it.
 
-    given: laws that the system file puts in place; what is found comes beside them.
+    given: laws of the system file, to which others are added.
     """
     rules = task.rules
     tests = rules.trials_of_a_law * len(pieces)
@@ -99,11 +99,11 @@ def search(
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
     base = refined(quick, given)
-    grown = _grown(base, pieces, tests, tell)
+    grown = _grown(base, pieces, tests, progress)
     composite = {piece.key for piece in grown.current.fit.model.pieces[len(given.pieces) :] if piece.plain > 0}
-    if composite:  # one law of many numbers does at once what several common ones do, one after the other
-        tell(f"without {', '.join(sorted(composite))}")
-        plainer = _grown(base, tuple(p for p in pieces if p.key not in composite), tests, tell)
+    if composite:  # a law with many parameters may anticipate a sum of common ones
+        progress(f"without {', '.join(sorted(composite))}")
+        plainer = _grown(base, tuple(p for p in pieces if p.key not in composite), tests, progress)
         grown = replace(_plainer_of(grown, plainer, rules), first=grown.first)
     final = refined(fine, grown.current.fit.model)
     screened: dict[str, float] = {}
@@ -121,8 +121,8 @@ class _Grown:
     first: tuple[Ranked, ...]  # models with one law, best first
 
 
-def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, tell: Progress) -> _Grown:
-    """A model that gets one law after the other, until the rest is noise or nothing explains enough of it."""
+def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, progress: Progress) -> _Grown:
+    """Forward selection until the residual is noise, or no law explains enough of it."""
     task, rules, given = base.task, base.task.rules, len(base.model.pieces)
     current = Ranked(base, 0.0, 0.0, effective_count(base.residual[: task.split]))
     steps: list[Step] = []
@@ -130,7 +130,7 @@ def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, tell: P
     for number in range(rules.most + rules.per_signal * len(task.signals)):
         if current.fit.at_noise:
             break
-        tell(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
+        progress(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
         ranked = next_laws(current.fit, _beside(pieces, current.fit.model, given), rules)
         if number == 0:
             first = tuple(ranked)
@@ -139,13 +139,13 @@ def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, tell: P
             break
         steps.append(step)
         current = _swapped(step.chosen, pieces, rules, given)
-        if current is not step.chosen:  # an earlier law gives way to one that suits the later better
+        if current is not step.chosen:  # an earlier law was exchanged
             steps = _renamed(steps, current, given, tests)
     return _Grown(current, tuple(steps), first)
 
 
 def _plainer_of(one: _Grown, other: _Grown, rules: ComponentRules) -> _Grown:
-    """The one that serves the held-out part better; of two that serve it as well, that of commoner laws."""
+    """The one that predicts the held-out part better; of two equal ones, that of commoner laws."""
     fits = [grown.current.fit for grown in (one, other)]
     best = min(fit.held_out for fit in fits)
     alike = [
@@ -155,9 +155,9 @@ def _plainer_of(one: _Grown, other: _Grown, rules: ComponentRules) -> _Grown:
 
 
 def _beside(pieces: tuple[LawPiece, ...], model: ComponentModel, given: int) -> tuple[LawPiece, ...]:
-    """Laws that a record can tell beside those that were found, which come after the given ones.
+    """Laws that are identifiable beside those found, which follow the `given` first ones.
 
-    Any loop is a sum of a friction and a hysteresis, so that two of them together imitate what neither is.
+    A sum of friction and hysteresis can imitate any loop, so at most one rate-independent hysteresis is added.
     """
     if not any(piece.dissipates for piece in model.pieces[given:]):
         return pieces
@@ -165,7 +165,7 @@ def _beside(pieces: tuple[LawPiece, ...], model: ComponentModel, given: int) -> 
 
 
 def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules) -> list[Ranked]:
-    """Fits by their evidence against one that all extend."""
+    """Fits by their evidence over one that all of them extend."""
     if not fits:
         return []
     best = min(fits, key=lambda fit: fit.error)
@@ -205,7 +205,7 @@ def next_laws(current: ComponentFit, pieces: tuple[LawPiece, ...], rules: Compon
 
 
 def _trials(current: ComponentFit, piece: LawPiece, rules: ComponentRules) -> list[tuple[float, ComponentModel]]:
-    """The best trial shapes of a law beside the present ones: sum of squares left and model."""
+    """The best trial shapes of a law beside the present ones: residual sum of squares, and model."""
     task = current.task
     if isinstance(piece, Lag):
         late = (current.model.plus(piece, (float(row[0]),)) for row in piece.grid(task.seen))
@@ -228,7 +228,7 @@ def _trials(current: ComponentFit, piece: LawPiece, rules: ComponentRules) -> li
 
 
 def plausible(fit: ComponentFit, index: int = -1) -> bool:
-    """Whether a law's values, the last one's, are ones that it can have, and that the sampling resolves."""
+    """Whether the values of a law, by default the last, are admissible and resolved by the sampling."""
     index %= len(fit.model.pieces)
     piece, strengths = fit.model.pieces[index], fit.strengths_of(index)
     if len(strengths) and not np.any(np.abs(strengths) > 0):
@@ -250,20 +250,20 @@ def plausible(fit: ComponentFit, index: int = -1) -> bool:
 
 
 def _determined(fit: ComponentFit, *, by_all: bool = False) -> bool:
-    """Whether the last law's first quoted value, or its first parameter, is larger than its deviation.
+    """Whether the last law's first parameter and first quoted value are significant.
 
-    by_all: with what the record leaves open besides chance.
+    by_all: with systematic errors.
     """
     index = len(fit.model.pieces) - 1
     full, names = covariance(fit)
     sigma = spread(fit, index, full + left_open(fit) if by_all else full, names)
     values = [fit.values(index), fit.quoted(index)]
-    told = [
-        abs(next(iter(of.values()))[0]) > fit.task.rules.told * float(s[0])
+    significant = [
+        abs(next(iter(of.values()))[0]) > fit.task.rules.significant * float(s[0])
         for of, s in zip(values, sigma, strict=True)
         if of
     ]
-    return all(told)
+    return all(significant)
 
 
 def _accepted(
@@ -339,9 +339,9 @@ def _removes_enough(fit: ComponentFit, before: ComponentFit, base: ComponentFit,
 
 
 def _plainest(near: list[Ranked], rules: ComponentRules) -> Ranked:
-    """The one that serves the held-out part best; of those that serve it as well, the commonest with fewest numbers.
+    """The model that predicts the held-out part best; of equal ones, the commonest law with fewest parameters.
 
-    Where nothing is left but noise, what fits even better fits the noise.
+    All models at the noise level count as equal.
     """
     best = min(ranked.fit.held_out for ranked in near)
     alike = [ranked for ranked in near if ranked.fit.held_out <= rules.as_well * best or ranked.fit.at_noise]
@@ -349,9 +349,9 @@ def _plainest(near: list[Ranked], rules: ComponentRules) -> Ranked:
 
 
 def _leaves_nothing(lag: ComponentFit, before: ComponentFit, most: float) -> bool:
-    """Whether a lag leaves next to nothing: hysteresis, too, looks late, and no channel is blamed for a part of it.
+    """Whether a lag explains nearly all of the error; a lag that explains a part of it may be hysteresis.
 
-    most: of the power beyond noise that was left before it.
+    most: share of the previous power beyond noise that may be left.
     """
     floor = lag.floor**2
     if before.held_out < before.task.rules.above * floor:
@@ -363,7 +363,7 @@ def _leaves_nothing(lag: ComponentFit, before: ComponentFit, most: float) -> boo
 
 
 def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules, given: int) -> Ranked:
-    """The same with one earlier law, but those that are given, exchanged for another where that is worth the margin."""
+    """The same with one earlier, not given law exchanged, if that gains the naming margin in evidence."""
     model = chosen.fit.model
     if len(model.pieces) < 2:
         return chosen
@@ -379,7 +379,7 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
 
 
 def _renamed(steps: list[Step], current: Ranked, given: int, tests: int) -> list[Step]:
-    """Steps of an exchanged model: every law against the model without it."""
+    """Steps of a model after an exchange: every law over the model without it."""
     model = current.fit.model
     result = []
     for index in range(given, len(model.pieces)):

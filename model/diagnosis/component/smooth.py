@@ -1,8 +1,8 @@
-"""Laws over the deflection, held against a smooth spring: several of them imitate any curve.
+"""Comparison of laws over the deflection with a smooth spring, since sums of several can imitate any curve.
 
-Stops, gaps and progressive springs are curves over the deflection.  A sum of them, or one of many numbers, comes close
-to any other curve, so that a good fit alone does not make them the component's.  A polynomial of as many numbers has
-none of their knees: they are named where they beat it.
+Stops, gaps and progressive springs are curves over the deflection.  A sum of them, or one with many parameters,
+approximates any curve.  They are named only if they fit better than a polynomial with as many parameters, which has
+no knees.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sprung.model.signals import FloatArray
 
 @dataclass(frozen=True)
 class SmoothSpring(SliderSurface):
-    """A polynomial of the deflection, from its square on: the spring has the rest."""
+    """A polynomial of the deflection from the second order on; the spring is the linear part."""
 
     title: str = "a smooth spring"
     key: str = "smooth spring"
@@ -36,10 +36,10 @@ class SmoothSpring(SliderSurface):
 
 
 def smooth_serves(fit: ComponentFit, first: int) -> bool:
-    """Whether a smooth spring of as many numbers serves as well as the laws over the deflection, from `first` on.
+    """Whether a smooth spring with as many parameters predicts as well as the laws over the deflection from `first` on.
 
-    Asked of several such laws, and of one with knees that imitates much; others have too few numbers to imitate
-    anything, and a progressive spring off centre is such a smooth spring itself.
+    Applies to several such laws, and to single flexible ones with knees; others have too few parameters, and a
+    progressive spring off centre is a smooth spring itself.
     """
     model, rules = fit.model, fit.task.rules
     curves = [i for i in range(first, len(model.pieces)) if model.pieces[i].kind is ELASTIC]
@@ -56,7 +56,7 @@ def smooth_serves(fit: ComponentFit, first: int) -> bool:
 
 
 def _numbers(fit: ComponentFit, index: int) -> int:
-    """Numbers of a law that act: a stop that is never touched has none."""
+    """Effective number of parameters of a law; a stop without contact has none."""
     strengths = fit.strengths_of(index)
     acting = int(np.sum(strengths != 0.0))
     return acting + max(0, len(fit.model.shapes[index]) - (len(strengths) - acting))

@@ -1,4 +1,4 @@
-"""Findings of a component test as values and sentences."""
+"""Findings of component tests: values and sentences."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from sprung.model.laws.sensor_faults import SENSOR_LAG
 from sprung.model.signals import FloatArray
 
 _DATA_SHEET_RATES = (0.05, 0.1, 0.2, 0.3, 0.52, 1.0, 1.5)  # m/s, at which damper makers quote forces
-_MIDDLE = 0.3  # of the travel: the rod is then in the middle of it
-_FEWEST = 5  # samples that tell a force
-_NEAR_RATE = 0.05  # of a rate: samples this close to it tell the force there
-_BAND = 0.8  # of the power of what is left, for the frequencies where it lies
+_MIDDLE = 0.3  # of the travel, central part for dynamometer forces
+_FEWEST = 5  # samples for a force
+_NEAR_RATE = 0.05  # relative distance of a sample's rate
+_BAND = 0.8  # of the residual's power, for its main band
 
 
 def finding_of(
@@ -36,7 +36,7 @@ def finding_of(
     sigma: tuple[FloatArray, FloatArray],
     alike: Sequence[str],
 ) -> Finding:
-    """The finding of one law; alike: names of others that the recording does not tell from it."""
+    """The finding of one law; alike: names of its look-alikes."""
     piece = fit.model.pieces[index]
     values, quoted = _parameters(fit.values(index), sigma[0]), _parameters(fit.quoted(index), sigma[1])
     if piece.dissipates:
@@ -45,9 +45,9 @@ def finding_of(
     family = _family(piece.effect, alike)
     rival = step.rivals[0] if step.rivals else None
     shown = [q for q in quoted if q.name in _SPOKEN] or list(values[:2])
-    told = ", ".join(f"{q.name.replace('_', ' ')} {q.words()}" for q in shown[:3])
+    main = ", ".join(f"{q.name.replace('_', ' ')} {q.words()}" for q in shown[:3])
     formula, memory = (piece.law.formula, piece.law.memory_formula) if isinstance(piece, FormulaPiece) else ("", "")
-    sentence = f"{element}: {f'a force {formula}' if formula else piece.title}, {told}"
+    sentence = f"{element}: {f'a force {formula}' if formula else piece.title}, {main}"
     if memory:
         sentence += f", z' = {memory}"
     if family is not None:
@@ -88,13 +88,13 @@ def _parameters(values: Values, sigma: FloatArray) -> tuple[LawParameter, ...]:
 
 
 def _family(effect: str, alike: Sequence[str]) -> str | None:
-    """A law and those that the recording does not tell from it; None: there are none."""
+    """A law and its look-alikes, in words; None without look-alikes."""
     others = [other for other in dict.fromkeys(alike) if other != effect]
     return " or ".join([effect, *others]) if others else None
 
 
 def _loop_area(fit: ComponentFit) -> LawParameter:
-    """Energy of the largest loop, J: the mean over the cycles of most travel, with their scatter."""
+    """Dissipated energy of the largest loops, J: mean and standard deviation over the cycles of most travel."""
     motion = fit.task.motion
     middle = motion.deflection - motion.middle
     starts = np.flatnonzero((middle[1:] > 0) & (middle[:-1] <= 0))
@@ -109,10 +109,10 @@ def _loop_area(fit: ComponentFit) -> LawParameter:
 
 
 def _forces_at_rates(fit: ComponentFit) -> tuple[LawParameter, ...]:
-    """Modelled force less preload at data-sheet rates that the test reached, extension then compression.
+    """Modelled force less preload at data-sheet rates within the range of the test, extension then compression.
 
-    Read as on a dynamometer, while the rod passes the middle of its travel, where it does at that rate.  Deviation:
-    by how much the model errs there on average, and what is left of chance over so many passes.
+    Evaluated as on a dynamometer, while the rod passes the middle of its travel.  The standard deviation comprises the
+    mean error of the model there and its random error over the passes.
     """
     motion, rows = fit.task.motion, []
     central = np.abs(motion.deflection - motion.middle) < _MIDDLE * fit.task.seen.travel
@@ -130,7 +130,7 @@ def _forces_at_rates(fit: ComponentFit) -> tuple[LawParameter, ...]:
 
 
 def preload_finding(element: str, value: float, sigma: float) -> Finding:
-    """A static force: gas, weight or setting of the rig.  Never a fault."""
+    """A static force, of gas, weight or mounting.  Never a fault."""
     parameter = LawParameter("force", value, sigma, "N")
     return Finding(
         element,
@@ -144,9 +144,9 @@ def preload_finding(element: str, value: float, sigma: float) -> Finding:
 
 
 def unknown_finding(element: str, step: Step, laws: tuple[Step, ...], *, mapped: bool) -> Finding:
-    """A force that no law explains; the laws that come closest are no finding, but worth a word.
+    """An unexplained force; the closest laws are mentioned in the sentence.
 
-    step: the unnamed force as it was found; mapped: its map is reported.
+    step: the unnamed force; mapped: whether its map is reported.
     """
     sentence = f"{element}: a force that no law of the catalogue explains{'; its map is reported' if mapped else ''}"
     closest = None
@@ -174,7 +174,7 @@ def unknown_finding(element: str, step: Step, laws: tuple[Step, ...], *, mapped:
 
 
 def reversed_finding(sensor: str, element: str) -> Finding:
-    """A force or a motion with the other sign."""
+    """A force or motion with the wrong sign."""
     return Finding(
         sensor,
         SIGN_REVERSED.name,
@@ -190,9 +190,9 @@ def reversed_finding(sensor: str, element: str) -> Finding:
 def late_finding(
     sensor: str, element: str, time: LawParameter, step: Step, alike: Sequence[str], *, filters: bool
 ) -> Finding:
-    """The force's channel late against the motion's, or early: filters and nodes of the rig, no physics.
+    """A lag (or lead) of the force channel relative to the motion: a fault of the measurement.
 
-    time: s, by which it is late, or, with `filters`, the constant of its filter.
+    time: delay, or time constant of a filter, s.
     """
     size = LawParameter("time", abs(1e3 * time.value), 1e3 * time.std, "ms")
     near, way = _family(SENSOR_LAG.name, alike), "later" if time.value > 0 else "earlier"
@@ -222,7 +222,7 @@ def late_finding(
 
 
 def leftover_words(element: str, fit: ComponentFit, size: float) -> str:
-    """Place, size and frequencies of what is left of a force."""
+    """Place, size and frequencies of the residual of a force."""
     held = fit.residual[fit.task.split :]
     power = np.abs(np.fft.rfft(held - held.mean())) ** 2
     frequency = np.fft.rfftfreq(len(held), fit.task.motion.step)

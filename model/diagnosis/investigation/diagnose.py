@@ -42,28 +42,28 @@ from sprung.model.system import System
 from sprung.model.work import WorkBudget
 
 
-def investigate(system: System, record: Recorded, options: Options, tell: Progress) -> Outcome:
+def investigate(system: System, record: Recorded, options: Options, progress: Progress) -> Outcome:
     """Baseline, then findings until the residual is noise.
 
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
-    return concluded(with_findings(begun(system, record, options, tell), tell), tell)
+    return concluded(with_findings(begun(system, record, options, progress), progress), progress)
 
 
-def with_findings(state: Investigation, tell: Progress) -> Investigation:
+def with_findings(state: Investigation, progress: Progress) -> Investigation:
     """Findings until the residual is noise."""
     # the residual of an estimated delay, scale or position is not searched for unmodelled dynamics
     uncertain, notes = any(fault.value is not None for fault in state.setup_faults), state.notes
     for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
         before = state
-        state = next_finding(state, number, tell)
+        state = next_finding(state, number, progress)
         if state.problem.work is not None and state.problem.worked_out:
-            tell(0.92, f"the search ends at its {state.problem.work.limit}: no further candidate is fitted")
+            progress(0.92, f"the search ends at its {state.problem.work.limit}: no further candidate is fitted")
         if state.calibrations and not before.calibrations:  # the search restarts with them in the model
-            return with_findings(replace(state, notes=notes), tell)
+            return with_findings(replace(state, notes=notes), progress)
         if len(state.found) == len(before.found):
             break
-        state = with_named_laws(before, state, lambda plain: with_findings(plain, tell), tell)
+        state = with_named_laws(before, state, lambda plain: with_findings(plain, progress), progress)
         state = without_redundant(state)
         if _still_rejected(state, before.fit) or another_structure(state):
             break  # further findings would only imitate another structure
@@ -82,20 +82,20 @@ def _still_rejected(state: Investigation, before: Fit) -> bool:
     return left > 1 - rules.carried and error > rules.rejected
 
 
-def concluded(state: Investigation, tell: Progress) -> Outcome:
+def concluded(state: Investigation, progress: Progress) -> Outcome:
     """The model on the whole recording, its errors on the held-out part, and the verdict."""
     work = state.problem.work
     ended = work.limit if work is not None and work.ended else ""  # the conclusion has no limit of work
     state = without_insignificant(state)
-    tell(0.93, "the model on the whole recording")
+    progress(0.93, "the model on the whole recording")
     final = _on_whole_recording(state)
     final = replace(final, covariance=final.covariance + form_covariance(state) + shared_gain_covariance(state))
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
-    said = judged(state, before, after, noisy, ended)
-    if np.any(said.errors.unexplained(state.options.rules.verdict) > 0):
+    judgement = judged(state, before, after, noisy, ended)
+    if np.any(judgement.errors.unexplained(state.options.rules.verdict) > 0):
         final = replace(final, covariance=final.covariance + misfit_covariance(state.problem, state.fit))
-    return Outcome(state, final, before, after, noisy, said)
+    return Outcome(state, final, before, after, noisy, judgement)
 
 
 def under(state: Investigation, rules: Rules) -> Investigation:
@@ -108,25 +108,25 @@ def under(state: Investigation, rules: Rules) -> Investigation:
     )
 
 
-def begun(system: System, record: Recorded, options: Options, tell: Progress) -> Investigation:
+def begun(system: System, record: Recorded, options: Options, progress: Progress) -> Investigation:
     """The nominal structure on the recording, with faulty inputs compensated, and its held-out part."""
-    tell(0.02, "channels and noise")
+    progress(0.02, "channels and noise")
     options = replace(options, work=options.work or WorkBudget(options.rules.fit.work))
     prepared = prepare(system, system.undistorted(record.values), record.sample_rate, options.rules.record)
     signals, split = cut(prepared.signals, options.rules.record.fitted)
     declared = declared_noise(system, signals, options.rules.record)
-    tell(0.05, "nominal structure identified again; screening all laws at all places")
+    progress(0.05, "nominal structure identified again; screening all laws at all places")
     start = nominal(system, signals, declared, split, options)
-    tell(0.15, "set-up: signs, channels, nodes, scales, positions")
+    progress(0.15, "set-up: signs, channels, nodes, scales, positions")
     system, corrected, setup = without_setup_faults(system, signals, declared, split, start.problem, start.fit)
     if setup:
         split, signals = fitted_samples(signals, corrected, split), corrected
         start = nominal(system, signals, declared, split, options)
-    tell(0.2, "input channels")
+    progress(0.2, "input channels")
     faults: tuple[InputFault, ...] = ()
     doubts: tuple[str, ...] = ()
     if not any(fault.value is not None for fault in setup):
-        start, faults, doubts = _without_input_faults(system, options, declared, start, tell)
+        start, faults, doubts = _without_input_faults(system, options, declared, start, progress)
     held = HeldOut(system, start.signals, start.problem.noise, split, options.rules)
     still = ("the last part of the recording hardly moves: findings were not validated on it",) if held.still else ()
     return Investigation(
@@ -148,7 +148,7 @@ def begun(system: System, record: Recorded, options: Options, tell: Progress) ->
 
 
 def _without_input_faults(
-    system: System, options: Options, declared: Noise, start: Nominal, tell: Progress
+    system: System, options: Options, declared: Noise, start: Nominal, progress: Progress
 ) -> tuple[Nominal, tuple[InputFault, ...], tuple[str, ...]]:
     """The baseline with faults of input channels compensated, these faults, and notes on implausible ones.
 
@@ -160,7 +160,7 @@ def _without_input_faults(
         candidate = best_input_fault(start.screening, options.rules.acceptance.alpha)
         if candidate is None:
             break
-        tell(0.25, f"input channel {candidate.location}")
+        progress(0.25, f"input channel {candidate.location}")
         fault, signals = compensate(system, start, candidate, declared, options)
         reason = out_of_range(fault.term)
         if reason is not None:

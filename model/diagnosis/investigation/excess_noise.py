@@ -12,10 +12,10 @@ from sprung.model.diagnosis.selection.holdout import FreeRun
 
 
 def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple[NoiseFault, ...]:
-    """Sensors and input channels that are noisier than their peers by more than chance.
+    """Sensors and input channels that are significantly noisier than their peers.
 
-    before, after: free runs without and with the findings.  What these have changed at a sensor they may have got
-    wrong by a little; that much is no noise of the sensor.
+    before, after: free runs without and with the findings.  A share of the power that the findings changed at a sensor
+    may be their inaccuracy, and does not count as noise.
     """
     declared = declared_noise(state.system, state.prepared.signals, state.options.rules.record)
     noise, rules = state.problem.noise, state.options.rules.noise
@@ -25,7 +25,7 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     names = list(state.signals.sensor_names)
     known = declared.sensors[np.isin(state.prepared.signals.sensor_index, state.signals.sensor_index)]
     inside = noise.sensors / known
-    # what is left of physics is no noise: noise goes on above the band that is compared
+    # noise extends above the compared band, unmodelled dynamics does not
     white = upper_ratio(state, known) > 1 + rules.white * (inside - 1)
     inaccuracy = rules.inaccuracy * np.mean((after.simulated - before.simulated) ** 2, axis=0)
     white &= (inside**2 - np.median(inside) ** 2) * known**2 > inaccuracy
@@ -57,7 +57,7 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
 def _outliers(
     names: list[str], ratio: np.ndarray, white: np.ndarray, count: float, rules: NoiseRules
 ) -> list[NoiseFault]:
-    """Channels whose ratio of noise to declared noise leaves that of the others."""
+    """Outliers among ratios of noise to declared noise."""
     found = []
     for i, name in enumerate(names):
         peers = [j for j in range(len(names)) if j != i]

@@ -69,7 +69,7 @@ def _best_accepted(problem: Problem, base: Fit, trials: list[Trial], unnamed: Tr
             problem, base
         ):
             continue
-        explains = trial.evidence >= unnamed.evidence - rules.slack and trial.gain >= rules.says * unnamed.gain
+        explains = trial.evidence >= unnamed.evidence - rules.slack and trial.gain >= rules.explains * unnamed.gain
         if trial.finished and explains and not trial.fit.bounded and not held.compare(unnamed.fit, trial.fit).refuted:
             return trial
     return None

@@ -58,7 +58,7 @@ def _force_to_express(state: Investigation, plain: list[Trial]) -> Trial | None:
         best = next(iter(forces), None)  # unless the residual belongs to another place
         return None if best is leader and missing(state.problem, leader.fit) <= rules.missing else best
     for force in forces:
-        if not force.named and leader.gain < rules.says * force.gain:
+        if not force.named and leader.gain < rules.explains * force.gain:
             luck = chance(force.gain - leader.gain, max(1, force.freedom - leader.freedom), 1)
             return force if luck < state.options.rules.acceptance.alpha else None
     return leader if own and missing(state.problem, leader.fit) > rules.missing else None

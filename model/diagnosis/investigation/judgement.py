@@ -1,4 +1,4 @@
-"""An investigation judged: its errors on the held-out part, what of them is noise, and the verdict."""
+"""Judgement of an investigation: held-out errors, their noise floor, and the verdict."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sprung.model.laws import ElementLaw, Law, StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
-_BAND = 0.8  # of the power of what is left, for the frequencies where it lies
+_BAND = 0.8  # of the residual's power, for its main band
 
 
 def judged(
@@ -98,12 +98,12 @@ def _carries(verdict: Verdict, physics: list[EffectKind]) -> bool:
 
 
 def _kind(state: Investigation, term: Term, law: Law) -> EffectKind:
-    """The kind of a finding, by its value, too: instruments are as far off as their data sheets leave them."""
+    """The kind of a finding; calibration errors within tolerance are nuisances."""
     return EffectKind.NUISANCE if within_tolerance(state, term) else kind_of(law)
 
 
 def leaves_more_than_noise(state: Investigation) -> bool:
-    """Whether the findings so far leave what a verdict would call unexplained."""
+    """Whether the findings so far leave an unexplained share."""
     run = state.held.run(state.fit.point)
     size = np.sqrt(np.mean(run.measured**2, axis=0))
     expected = state.held.noise_rms(state.fit, bounded(state)) / np.where(size > 0, size, 1.0)
@@ -113,17 +113,15 @@ def leaves_more_than_noise(state: Investigation) -> bool:
 
 
 def changed_parts(state: Investigation) -> int:
-    """How many changes of the structure there are among the findings: elements elsewhere and linear parts."""
+    """Number of structural changes among the findings: moved elements and linear parts."""
     moved = sum(fault.effect is WRONG_BODY for fault in state.setup_faults)
     return moved + sum(is_part(found.trial.term.law) for found in state.found)
 
 
 def is_part(law: Law) -> bool:
-    """Whether a law is a linear part of the structure: a connection, a hung mass, a spring in series, rubber.
+    """Whether a law is a linear structural part: a connection, suspended mass, series spring, rubber.
 
-    A value that the file holds wrong is none.
-
-    Sums of them come close to any other structure.
+    Wrong values of the file are none.  Sums of such parts approximate any other structure.
     """
     if isinstance(law, StructureLaw):
         return not law.holds
@@ -131,9 +129,9 @@ def is_part(law: Law) -> bool:
 
 
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
-    """Whether the findings change the structure so often that together they imitate one which the file is not.
+    """Whether so many structural changes were found that they imitate another structure than the file's.
 
-    More than a few in any case; more than one where they leave more than next to nothing (`errors`).
+    More than a few in any case, more than one if they leave a significant error (`errors`).
     """
     rules, parts = state.options.rules.verdict, changed_parts(state)
     if parts < 2 or errors is None:
@@ -144,7 +142,7 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
 
 
 def bounded(state: Investigation) -> Noise:
-    """Noise levels that the floor may use: learnt ones, no higher than declared or seen above the compared band."""
+    """Noise levels for the floor: estimated ones, at most as declared or observed above the compared band."""
     prepared = state.prepared.signals
     declared = declared_noise(state.system, prepared, state.options.rules.record)
     present = np.isin(prepared.sensor_index, state.signals.sensor_index)
@@ -159,8 +157,8 @@ def bounded(state: Investigation) -> Noise:
 def realised_floor(expected: FloatArray, after: FreeRun, rules: VerdictRules = RULES.verdict) -> FloatArray:
     """Noise floor of each sensor on the held-out samples themselves.
 
-    The estimated noise would give `expected` on average; these samples had their own.  Where the free run errs by
-    no more than that within sampling error, its error is noise, and is the floor.
+    `expected` is the mean for the estimated noise.  If the error of the free run agrees with it within sampling error,
+    it is noise, and the floor of these samples.
     """
     spread = rules.spread * np.sqrt(1 / (2 * len(after.measured)))
     return np.where(np.abs(after.per_sensor / expected - 1) < spread, after.per_sensor, expected)
@@ -172,14 +170,14 @@ def _compared(state: Investigation, noise: Noise) -> tuple[tuple[Fit, Noise], ..
 
 
 def unmeasured_share(fit: Fit, force: FloatArray) -> float:
-    """Forces that nobody measured, as noise of the measured ones, over the inertia forces, rms over rms."""
+    """Unmeasured forces, as noise of the measured ones, relative to the inertia forces, rms over rms."""
     structure = fit.forward.plant.structure
     inertia = structure.mass * fit.forward.part.grid.inverse(fit.motions.acceleration)
     return float(np.sqrt(np.sum(structure.F**2 @ force**2) / np.sum(np.mean(inertia**2, axis=0))))
 
 
 def _place(state: Investigation) -> str:
-    """Where the screening sees most of what is left."""
+    """Location of the highest score of the remaining misfit."""
     here = [candidate for candidate in state.last.candidates if candidate.family in (ELEMENT, UNNAMED)] or list(
         state.last.candidates
     )
@@ -187,7 +185,7 @@ def _place(state: Investigation) -> str:
 
 
 def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun) -> str:
-    """Place, size and frequencies of what is left, empty where nothing is."""
+    """Place, size and frequencies of the misfit, in words; empty without misfit."""
     left = errors.unexplained(state.options.rules.verdict)
     if not np.any(left > 0):
         return ""
@@ -202,7 +200,7 @@ def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun) -> str:
 
 
 def main_band(error: FloatArray, sample_rate: float) -> tuple[float, float]:
-    """The frequencies between which most of the power of an error (T,) lies, Hz."""
+    """Band with most of the power of an error (T,), Hz."""
     power = np.abs(np.fft.rfft(error - np.mean(error))) ** 2
     share = np.cumsum(power) / max(float(np.sum(power)), 1e-300)
     frequency = np.fft.rfftfreq(len(error), 1 / sample_rate)

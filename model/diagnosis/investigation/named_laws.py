@@ -16,7 +16,7 @@ from sprung.model.laws import ElementLaw
 
 
 def with_named_laws(
-    before: Investigation, unnamed: Investigation, search: Callable[[Investigation], Investigation], tell: Progress
+    before: Investigation, unnamed: Investigation, search: Callable[[Investigation], Investigation], progress: Progress
 ) -> Investigation:
     """The investigation with named laws if they explain as much as the unnamed force, else that with the force.
 
@@ -25,7 +25,7 @@ def with_named_laws(
     """
     if unnamed.problem.process_noise or _needs_no_names(unnamed):
         return unnamed
-    tell(0.3 + 0.17 * len(before.found), "named laws in place of an unnamed force")
+    progress(0.3 + 0.17 * len(before.found), "named laws in place of an unnamed force")
     named = search(replace(before, options=replace(before.options, unnamed=False)))
     if len(named.found) <= len(before.found) or not _explains_as_much(before, unnamed, named):
         return unnamed

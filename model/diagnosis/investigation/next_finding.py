@@ -44,7 +44,7 @@ class _Competition:
     implausible: list[tuple[Trial, str]]  # of more evidence than any finding, with the reason for doubt
 
 
-def next_finding(state: Investigation, number: int, tell: Progress) -> Investigation:
+def next_finding(state: Investigation, number: int, progress: Progress) -> Investigation:
     """The investigation with one more finding; without one if the residual is noise or no candidate is accepted."""
     candidates = _candidates(state)
     if candidates or share_an_element(state):
@@ -52,17 +52,17 @@ def next_finding(state: Investigation, number: int, tell: Progress) -> Investiga
     wide = best_wider(state)
     promised = max((candidate.score for candidate in candidates), default=0.0)
     if wide is not None and wide.fall > promised and is_better(state, wide, []):
-        return next_finding(adopt_wider(state, wide), number, tell)
+        return next_finding(adopt_wider(state, wide), number, progress)
     if not candidates:
         return state
     share = 0.25 + 0.17 * number
-    competition = _competition(state, candidates, lambda text: tell(share, text))
+    competition = _competition(state, candidates, lambda text: progress(share, text))
     state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in competition.implausible)))
     if wide is not None and is_better(state, wide, competition.leading):
-        return next_finding(adopt_wider(state, wide), number, tell)
+        return next_finding(adopt_wider(state, wide), number, progress)
     if not competition.leading:
         return state
-    tell(share + 0.08, f"checking {competition.leading[0].term.location}")
+    progress(share + 0.08, f"checking {competition.leading[0].term.location}")
     trials, note = with_formula(state, competition.findings, competition.leading)
     chosen = trials[0]
     p_value = _p_value(state, chosen)
@@ -76,7 +76,7 @@ def next_finding(state: Investigation, number: int, tell: Progress) -> Investiga
     state, trial = _refitted(state, chosen, trials)
     rivals = tuple(t for t in trials if t is not trial)
     found = Found(trial, rivals, second, p_value, tuple(t for t, _ in competition.implausible))
-    tell(share + 0.12, "screening the residual")
+    progress(share + 0.12, "screening the residual")
     last = screen(state.problem, state.fit, state.problem.system.catalogue, state.options.project)
     return replace(state, found=(*state.found, found), last=last, notes=(*state.notes, *note))
 
@@ -90,10 +90,10 @@ def _candidates(state: Investigation) -> list[Candidate]:
     return untried(state, shortlist(screening, rules.acceptance.alpha, options.multiplicity, rules, gross=gross))
 
 
-def _competition(state: Investigation, candidates: list[Candidate], tell: Callable[[str], None]) -> _Competition:
+def _competition(state: Investigation, candidates: list[Candidate], progress: Callable[[str], None]) -> _Competition:
     """All candidates fitted, and which of them are findings."""
     rules = state.options.rules
-    tried = with_wider_rivals(state, compete(state.problem, state.fit, candidates, tell))
+    tried = with_wider_rivals(state, compete(state.problem, state.fit, candidates, progress))
     doubts = [(trial, doubt(trial.fit, trial.term, rules.plausible, before=state.fit)) for trial in tried]
     believed = [trial for trial, reason in doubts if reason is None]
     present = [trial for trial in tried if not hardly_there(trial.fit, rules.plausible)]

@@ -82,8 +82,8 @@ class Hypothesis:
     value: float | None  # time s, ratio, offset m
     misfit: float  # by spectra
     undo: changes.Undo
-    by_mass: bool = False  # from frequencies above all modes: fitted whatever spectra at wrong resonances say
-    unranked: bool = False  # the same under a measured force only, after hypotheses that spectra rank
+    by_mass: bool = False  # from frequencies above all modes: fitted whatever their rank by spectra
+    unranked: bool = False  # the same under a measured force only, after ranked hypotheses
 
     @classmethod
     def of(

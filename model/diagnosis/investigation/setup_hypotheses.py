@@ -182,7 +182,7 @@ def _delays(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
     for group in wired.groups():
         count = len(group.sensors) + len(group.supports)
         if len(group.sensors) == len(wired.sensors):
-            if wired.signals.support_names:  # the motions are early: said of neither
+            if wired.signals.support_names:  # the motions are early: attributed to neither
                 continue
         elif count < 2:
             continue
@@ -208,9 +208,8 @@ def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
 def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
     """All sensors late, or in another unit, against the measured forces, or these against them.
 
-    Resonances a tenth off leave nothing to compare spectra by; above all modes the masses alone tell what a force
-    does, whatever the stiffnesses are.  Standard gravity in the ratio is said of the sensors, any other of the forces,
-    which are fewer.
+    With resonances a tenth off, spectra are not comparable; above all modes the response to forces depends on the
+    masses only.  A ratio of standard gravity is attributed to the sensors, any other to the forces, which are fewer.
     """
     if len(wired.sensors) < 2:
         return

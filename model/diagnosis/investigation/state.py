@@ -1,4 +1,4 @@
-"""The state of an investigation as frozen values: what goes in, every step between two findings, what comes out."""
+"""State of an investigation, as frozen values: inputs, state after every finding, result."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from sprung.model.signals import FloatArray
 from sprung.model.system import System
 from sprung.model.work import WorkBudget
 
-Progress = Callable[[float, str], None]  # share done, what comes next
+Progress = Callable[[float, str], None]  # share done, next step in words
 
 
 class Recorded(Protocol):
-    """What is needed of a recording; `replay.record.Record` has it."""
+    """Interface of a recording, as of `replay.record.Record`."""
 
     @property
     def sample_rate(self) -> float: ...
@@ -38,21 +38,21 @@ class Recorded(Protocol):
 
 @dataclass(frozen=True)
 class Options:
-    """How to diagnose.  The first three switch parts off, for measuring what each is worth."""
+    """Options of a diagnosis.  The first three switch off parts, to measure their benefit."""
 
-    project: bool = True  # take out of every candidate what the nominal parameters can imitate
-    multiplicity: bool = True  # account for the number of candidates tried
+    project: bool = True  # project candidates onto the complement of the nominal parameters
+    multiplicity: bool = True  # correct for multiple testing
     held_out: bool = True  # accept a finding only if it improves the part that no fit saw
-    unnamed: bool = True  # whether forces without a name, and their formulas, are sought, too
+    unnamed: bool = True  # search unnamed forces and formulas as well
     file: str = ""  # name of the recording, for the report
-    rules: Rules = RULES  # every number that decides
-    memory: FitMemory | None = None  # of the same recording's earlier diagnoses
-    work: WorkBudget | None = None  # what its fits may cost; None: as the rules say
+    rules: Rules = RULES  # all deciding numbers
+    memory: FitMemory | None = None  # cache of earlier diagnoses of the same recording
+    work: WorkBudget | None = None  # budget of its fits; None: by the rules
 
 
 @dataclass(frozen=True)
 class InputFault:
-    """A fault of an input channel and what it explains."""
+    """A fault of an input channel."""
 
     term: Term
     std: float
@@ -63,19 +63,19 @@ class InputFault:
 
 @dataclass(frozen=True)
 class NoiseFault:
-    """A channel that is noisier than its peers by more than chance."""
+    """A channel that is significantly noisier than its peers."""
 
     location: str
     ratio: float  # noise over the noise declared
     std: float  # of the ratio
     usual: float  # the same ratio of its peers
-    sigmas: float  # by which the logarithm of the ratio leaves theirs
+    sigmas: float  # significance of the difference of logarithms
     p_value: float
 
 
 @dataclass(frozen=True)
 class Nominal:
-    """The nominal structure identified on the first part of the signals, and what its residual shows."""
+    """The nominal structure identified on the first part of the signals, with the screening of its residual."""
 
     signals: Signals  # with input faults known so far compensated
     problem: Problem
@@ -84,19 +84,19 @@ class Nominal:
 
     @property
     def split(self) -> int:
-        """How many samples were fitted."""
+        """Number of fitted samples."""
         return self.problem.part.grid.samples
 
 
 @dataclass(frozen=True)
 class Found:
-    """One accepted finding with what it was chosen among."""
+    """One accepted finding with its rivals."""
 
     trial: Trial
-    trials: tuple[Trial, ...]  # that could have been chosen instead
+    trials: tuple[Trial, ...]  # its rivals
     runner_up: Trial | None  # the best with another law
     p_value: float
-    implausible: tuple[Trial, ...] = ()  # that say more, with values that their laws cannot have
+    implausible: tuple[Trial, ...] = ()  # of more evidence, with implausible values
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Widened:
 
 @dataclass(frozen=True)
 class TriedWider:
-    """What the wider forms of a fit's laws come to."""
+    """Result of the wider forms of a fit's laws."""
 
     of: Fit
     best: Widened | None  # None: no law has one
@@ -120,7 +120,7 @@ class TriedWider:
 
 @dataclass(frozen=True)
 class Investigation:
-    """Everything known between two findings."""
+    """State between two findings."""
 
     system: System
     options: Options
@@ -129,7 +129,7 @@ class Investigation:
     signals: Signals  # with input faults compensated
     problem: Problem
     base: Fit  # the nominal structure
-    fit: Fit  # with the findings so far, on the first part; what is judged on the held-out part
+    fit: Fit  # with the findings so far, on the first part; judged on the held-out part
     held: HeldOut
     first: Screening
     last: Screening
@@ -138,36 +138,36 @@ class Investigation:
     setup_faults: tuple[SetupFault, ...] = ()
     notes: tuple[str, ...] = ()
     wider: TriedWider | None = None  # of the present fit or an earlier one; None: not tried yet
-    calibrations: int | None = None  # how many of the given terms are gains and zeros in order; None: none has shown
+    calibrations: int | None = None  # number of calibration errors among the given terms; None: none was found
 
     @property
     def given(self) -> int:
-        """How many laws the system file itself puts in place: the first terms of every fit."""
+        """Number of laws of the system file, the first terms of every fit."""
         return len(self.base.point.terms)
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What an investigation comes to."""
+    """Judgement of an investigation."""
 
     errors: HeldOutErrors  # of the held-out part, per sensor
     verdict: Verdict
     floor: FloatArray  # bounded noise, in the sensors' units, (S,)
-    rejected: float | None  # error over the signal of a model that does not describe the recording
-    lost_phase: bool  # the free run's errors say little: judged was how the motion goes on
-    parts: int  # changes of the structure that were needed, where they are too many to be believed; else 0
-    ended: str  # what the search ended at, its "budget of work" or "limit of time"; empty where it came to its end
-    carried: bool  # the findings carry the verdict: what they explain outweighs what they leave
-    place: str  # where most of what is left is seen
-    where: str  # the same in words, with size and frequencies; empty where nothing is left
+    rejected: float | None  # relative error of a rejected model; None if not rejected
+    lost_phase: bool  # whether the verdict is based on unmeasured forces, not on the free run
+    parts: int  # number of structural changes, if too many to be plausible; else 0
+    ended: str  # "budget of work" or "limit of time" that ended the search; else empty
+    carried: bool  # whether the findings explain more than they leave
+    place: str  # of most of the misfit
+    where: str  # the same in words, with size and frequencies; empty without misfit
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A finished investigation, with everything that the report is made from."""
+    """Result of a finished investigation, from which the report is made."""
 
     investigation: Investigation
-    final: Fit  # the model on the whole recording, where that succeeds: its values are reported
+    final: Fit  # on the whole recording if that succeeds, with the reported values
     before: FreeRun  # held-out part without the findings
     after: FreeRun  # held-out part with the findings
     noise_faults: tuple[NoiseFault, ...]

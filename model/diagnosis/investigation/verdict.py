@@ -1,12 +1,12 @@
 """The verdict: one pure function of errors, bounded noise and findings, decided before anything is written.
 
-Three errors are told apart on the held-out part, as shares of every sensor's measured power:
+Three errors are distinguished on the held-out part, as shares of every sensor's measured power:
 
     before - after          explained by the findings
     floor                   noise, bounded by what was declared or measured independently of the model
     after - floor           unexplained
 
-`consistent` needs an unexplained share of nothing.  A floor that only the misfit itself suggests is no bound.
+`consistent` requires no unexplained share.  A noise level estimated from the misfit alone is no bound.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_phys
 
 
 class EffectKind(Enum):
-    """What a finding of an effect speaks for, as reports name it."""
+    """The kind of a finding, as reports name it."""
 
     LISTED = "law"  # physics of a listed law
     UNLISTED = "unlisted"  # physics that no law explains: a surface, a formula
@@ -36,7 +36,7 @@ class EffectKind(Enum):
 
 
 def kind_of(effect: Law | SetupEffect) -> EffectKind:
-    """The kind of a law or of a wrong set-up."""
+    """The kind of a law or of a set-up fault."""
     if isinstance(effect, SetupEffect) or effect.fault:
         return EffectKind.FAULT
     if effect.nuisance:
@@ -53,11 +53,11 @@ class HeldOutErrors:
     floor: FloatArray  # bounded noise
 
     def bounded(self, rules: VerdictRules = RULES.verdict) -> FloatArray:
-        """The floor with what sampling leaves of a perfect model, (S,)."""
+        """The floor, with the sampling error of a perfect model, (S,)."""
         return np.hypot(self.floor, rules.least)
 
     def unexplained(self, rules: VerdictRules = RULES.verdict) -> FloatArray:
-        """Share of every sensor's power that neither the model nor bounded noise explains; 0 where that is nothing."""
+        """Share of every sensor's power that neither model nor bounded noise explains, (S,); 0 if insignificant."""
         floor = self.bounded(rules)
         pooled = np.sqrt(np.mean(self.after**2)) > rules.clear * np.sqrt(np.mean(floor**2))
         left = (self.after > rules.clear_sensor * floor) | (pooled & (self.after > rules.clear * floor))
@@ -81,8 +81,8 @@ def verdict_of(
 ) -> Verdict:
     """The verdict for findings of the given kinds, best first, and the errors that they leave.
 
-    other_structure: they change the structure so often that together they imitate one which the system file is not.
-    ended: the budget of work was spent, so that what was not tried may well have been there.
+    other_structure: the findings imitate another structure than the system file's.
+    ended: the search ended at its limit, so that effects may have been missed.
     """
     if other_structure:
         return "unknown_physics"
@@ -90,7 +90,7 @@ def verdict_of(
     named = [kind for kind in kinds if kind is not EffectKind.NUISANCE]
     faults_only = bool(named) and all(kind is EffectKind.FAULT for kind in named)
     if float(np.sqrt(np.mean(errors.after**2))) > rules.rejected and (left or not faults_only):
-        return "unknown_physics"  # no model of the vehicle, whatever the noise
+        return "unknown_physics"  # the model is rejected, whatever the noise
     if not named:
         return "unknown_physics" if left or ended else "consistent"
     share = errors.explained(rules)
@@ -106,8 +106,8 @@ def verdict_of(
 def bounded_noise(
     learnt: FloatArray, declared: FloatArray, measured: FloatArray, slack: float = RULES.verdict.slack
 ) -> FloatArray:
-    """Noise levels that a floor may use: what was learnt, but no more than was declared or independently measured.
+    """Noise levels for the floor: as estimated, but at most as declared or independently measured.
 
-    slack: a declaration is a round number.
+    slack: factor on declarations, which are round numbers.
     """
     return np.minimum(learnt, slack * np.maximum(declared, measured))

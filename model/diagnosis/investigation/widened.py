@@ -147,10 +147,10 @@ def _cost(state: Investigation, fit: Fit, index: int) -> float:
     """Cost in evidence of the additional parameters of a widened law."""
     term, place = fit.point.terms[index], fit.place(index)
     more = slice(len(state.fit.point.terms[index].parameters), None)
-    told = fit.covariance[place, place][more, more] / np.outer(term.slopes[more], term.slopes[more])
+    determined = fit.covariance[place, place][more, more] / np.outer(term.slopes[more], term.slopes[more])
     logs = [spec.log for spec in term.law.parameters[more]]
     rules = state.problem.rules.evidence
-    return occam_cost(logs, term.scales[more], told, rules) + rules.rarity * term.law.prior_cost
+    return occam_cost(logs, term.scales[more], determined, rules) + rules.rarity * term.law.prior_cost
 
 
 def _starts(base: Fit, index: int) -> Iterator[Point]:

@@ -1,4 +1,4 @@
-"""From a recording's columns to signals that can be used: gaps closed, stuck and missing channels named."""
+"""Signals from the columns of a recording: gaps closed, stuck and missing channels reported."""
 
 from __future__ import annotations
 
@@ -25,32 +25,53 @@ class DiagnosisError(ValueError):
 
 
 class TooLittleError(DiagnosisError):
-    """The recording is what it should be, but too short or too still to decide anything."""
+    """The recording is valid, but too short or too still to decide anything."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Signals, and what was wrong with the channels."""
+    """Signals, and faults of the channels."""
 
     signals: Signals
     stuck: tuple[tuple[str, float], ...]  # channel, s from the start of the recording at which it froze
     notes: tuple[str, ...]
-    used: str = ""  # in words: the stretch of the recording that is diagnosed, where that is not all of it
+    used: str = ""  # the diagnosed stretch in words, if not the whole recording
 
 
 def prepare(system: System, values: FloatArray, sample_rate: float, rules: RecordRules = RULES.record) -> Prepared:
-    """Sort columns (T, C) in the order of `system.channels` by role.
+    """Signals by role from columns (T, C) in the order of `system.channels`.
 
-    Errors: `DiagnosisError` when an input is missing, `TooLittleError` when too little is left or nothing moves.
+    Errors: `DiagnosisError` if an input is missing, `TooLittleError` for too short or motionless recordings.
     """
     names = [channel.name for channel in system.channels]
     if values.ndim != 2 or values.shape[1] != len(names):
         raise DiagnosisError(f"values: expected shape (samples, {len(names)}), came {values.shape}")
     values = np.array(values, dtype=float)
     notes: list[str] = []
+    stuck = _blank_unusable(system, values, names, sample_rate, notes, rules)
+    first, last = _long_enough(values, sample_rate, notes, rules)
+    values, begin, factor = _slowed(system, _close_gaps(values[first:last]), sample_rate, rules)
+    if factor > 1:
+        notes.append(
+            f"diagnosed at {sample_rate / factor:g} Hz instead of {sample_rate:g} Hz, behind a linear-phase filter: "
+            "at higher frequencies the sensors show nothing but noise"
+        )
+    begin, sample_rate = first / sample_rate + begin, sample_rate / factor
+    start, stop, used = _affordable(system, values, sample_rate, begin, rules.longest)
+    values, begin = values[start:stop], begin + start / sample_rate
+    prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, begin, rules)
+    signals = _above_drift(system, replace(prepared.signals, averaged=factor), notes, rules)
+    _require_motion(system, signals, rules)
+    return replace(prepared, signals=signals, notes=tuple(notes), used=used)
+
+
+def _blank_unusable(
+    system: System, values: FloatArray, names: list[str], sample_rate: float, notes: list[str], rules: RecordRules
+) -> list[tuple[str, float]]:
+    """Sets standstill and stuck channels in the columns (T, C) to NaN; the stuck channels with their times, s."""
     resting = {n for n, s in system.file.inputs.items() if s.kind == "force" and not np.any(values[:, names.index(n)])}
     notes += [
-        f"input {name} is zero throughout: taken for no force" for name in sorted(resting) if _recorded(system, name)
+        f"input {name} is zero throughout: treated as no force" for name in sorted(resting) if _recorded(system, name)
     ]
     still = standstill(values, max(int(sample_rate), rules.stuck_samples), rules.resting)
     if still.any() and not still.all():
@@ -58,8 +79,12 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
         notes.append(
             f"standstill of {still.sum() / sample_rate:.1f} s is left out: the longest stretch that moves is used"
         )
-    steady = {"speed"} if system.on_track else set()  # may be the same for minutes
-    stuck = _blank_stuck(values, names, sample_rate, resting | steady, rules)
+    steady = {"speed"} if system.on_track else set()  # may be constant for minutes
+    return _blank_stuck(values, names, sample_rate, resting | steady, rules)
+
+
+def _long_enough(values: FloatArray, sample_rate: float, notes: list[str], rules: RecordRules) -> tuple[int, int]:
+    """First and last sample of the longest usable stretch.  Errors: `TooLittleError` if it is too short."""
     first, last = _usable_stretch(values, max(1, int(rules.gap * sample_rate)))
     if last - first < rules.minimum_samples:
         raise TooLittleError(
@@ -70,35 +95,33 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
         notes.append(
             f"gaps too long to close: used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording"
         )
-    values, begin, factor = _slowed(system, _close_gaps(values[first:last]), sample_rate, rules)
-    if factor > 1:
-        notes.append(
-            f"diagnosed at {sample_rate / factor:g} Hz instead of {sample_rate:g} Hz, behind a linear-phase filter: "
-            "no sensor shows more than noise that is faster"
-        )
-    begin, sample_rate = first / sample_rate + begin, sample_rate / factor
-    start, stop, used = _affordable(system, values, sample_rate, begin, rules.longest)
-    values, begin = values[start:stop], begin + start / sample_rate
-    prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, begin, rules)
-    signals, edge = passed(system, replace(prepared.signals, averaged=factor), rules)
+    return first, last
+
+
+def _above_drift(system: System, signals: Signals, notes: list[str], rules: RecordRules) -> Signals:
+    """Signals without the drift of supports that are measured by acceleration alone.
+
+    Errors: `TooLittleError` if too little is left.
+    """
+    filtered, edge = passed(system, signals, rules)
     if edge:
+        end = filtered.start + filtered.samples / filtered.sample_rate
         notes.append(
             f"supports measured by accelerations alone: all signals are compared above {edge:.2g} Hz, "
-            f"{signals.start:.1f} s to {signals.start + signals.samples / sample_rate:.1f} s of the recording"
+            f"{filtered.start:.1f} s to {end:.1f} s of the recording"
         )
-        if signals.samples < rules.minimum_samples:
+        if filtered.samples < rules.minimum_samples:
             raise TooLittleError(
-                f"too short to decide anything: {len(values) / sample_rate:.1f} s, of which "
+                f"too short to decide anything: {signals.samples / signals.sample_rate:.1f} s, of which "
                 f"{rules.settled / edge:.1f} s at either end are lost to accelerations that must be integrated"
             )
-    _require_motion(system, signals, rules)
-    return replace(prepared, signals=signals, notes=tuple(notes), used=used)
+    return filtered
 
 
 def _slowed(
     system: System, values: FloatArray, sample_rate: float, rules: RecordRules
 ) -> tuple[FloatArray, float, int]:
-    """Columns at a lower rate where nothing is lost by it, the time of their first sample, and by what they are so."""
+    """Columns at a lower rate if that loses nothing, the time of their first sample, s, and the reduction factor."""
     factor = slower_by(system, values, sample_rate, rules)
     if factor == 1:
         return values, 0.0, factor
@@ -109,7 +132,7 @@ def _slowed(
 def _affordable(
     system: System, values: FloatArray, sample_rate: float, begin: float, longest: int
 ) -> tuple[int, int, str]:
-    """The stretch of gap-free columns (T, C) that is diagnosed, and what of the recording that is, in words.
+    """First and last sample of gap-free columns (T, C) that are diagnosed, and the stretch in words.
 
     begin: time of their first sample, s.
     """
@@ -121,13 +144,13 @@ def _affordable(
     used = (
         f"{begin + start / sample_rate:.0f} s to {begin + stop / sample_rate:.0f} s of the recording, which has "
         f"{len(values) / sample_rate:.0f} s that can be used, were diagnosed, where the sensors move most: memory and "
-        "time grow with the length, and the rest would tell the same values a little more exactly"
+        "time grow with the length, and the rest would only make the same values slightly more precise"
     )
     return start, stop, used
 
 
 def _recorded(system: System, name: str) -> bool:
-    """Whether a force is one that recordings are said to hold."""
+    """Whether a force has an address in recordings."""
     source = system.file.inputs[name]
     return isinstance(source, ForceInput) and any((source.mcap, source.can, source.csv, source.column))
 
@@ -148,7 +171,7 @@ def _require_motion(system: System, signals: Signals, rules: RecordRules) -> Non
 def _blank_stuck(
     values: FloatArray, names: list[str], sample_rate: float, resting: set[str], rules: RecordRules
 ) -> list[tuple[str, float]]:
-    """Columns that repeat one value for long (a share of the recording) become NaN, but for those that rest."""
+    """Columns that repeat one value for a share of the recording become NaN, except resting ones; these columns."""
     found = []
     for column, name in enumerate(names):
         series = values[:, column]
@@ -202,7 +225,7 @@ class _Inputs:
     support_names: list[str]
     force_names: list[str]
     fused: list[FusedMotion]
-    levelled: FloatArray | None  # the acceleration of a support that nothing else tells of: then it is the only one
+    levelled: FloatArray | None  # acceleration of a support that is its only measurement
 
 
 def _inputs(system: System, values: FloatArray, dt: float, frozen: set[str], notes: list[str]) -> _Inputs:
@@ -210,7 +233,7 @@ def _inputs(system: System, values: FloatArray, dt: float, frozen: set[str], not
     found = _Inputs([], [], [], [], [], [], [], [], None)
     column = 0
     for name, source in system.file.inputs.items():
-        if isinstance(source, TrackInput):  # nobody measures it
+        if isinstance(source, TrackInput):  # not measured
             continue
         quantities = list(source.measured) if isinstance(source, SupportInput) else [""]
         there = {q: values[:, column + i] for i, q in enumerate(quantities) if not np.isnan(values[0, column + i])}
@@ -258,7 +281,7 @@ def _by_role(
         kept = _second_derivative(inputs.displacement[0], inputs.levelled, 1 / sample_rate)
         sensors = _without_offsets(sensors, kept, system.mechanics.sensor_kind == ACCELERATION)
     elif inputs.force_names and not inputs.support_names and _held(system, rules):
-        still = np.zeros(len(sensors))  # what does not go away has no acceleration in the long run
+        still = np.zeros(len(sensors))  # bounded motion has no mean acceleration
         sensors = _without_offsets(sensors, still, system.mechanics.sensor_kind == ACCELERATION)
     empty = np.zeros((len(values), 0))
     signals = Signals(
@@ -286,7 +309,7 @@ def _held(system: System, rules: RecordRules) -> bool:
 
 
 def _moved(source: SupportInput, measured: dict[str, FloatArray], dt: float) -> tuple[FloatArray, FloatArray]:
-    """Displacement of a support, and its velocity where that is measured beside it and nothing else (else NaN)."""
+    """Displacement of a support, and its velocity if these two are measured (else NaN)."""
     apart = np.full(len(next(iter(measured.values()))), np.nan)
     if "displacement" in measured and "acceleration" not in measured:
         return measured["displacement"], measured.get("velocity", apart)
@@ -300,7 +323,7 @@ def _fused(source: SupportInput, measured: dict[str, FloatArray], support: int) 
 
 
 def _without_offsets(sensors: FloatArray, base: FloatArray, accelerations: np.ndarray) -> FloatArray:
-    """Sensors (T, S), the accelerations among them level in the long run with that of the support, (T,).
+    """Sensors (T, S), accelerations with the mean of the support's acceleration (T,).
 
     A taper that vanishes with its slope at both ends takes the mean of a relative acceleration to some
     (2 pi / duration)^2 of the relative displacement: nothing.
@@ -311,7 +334,7 @@ def _without_offsets(sensors: FloatArray, base: FloatArray, accelerations: np.nd
 
 
 def _second_derivative(displacement: FloatArray, acceleration: FloatArray, dt: float) -> FloatArray:
-    """A measured acceleration (T,) less what its twofold integral, the displacement (T,), has lost of it."""
+    """A measured acceleration (T,), filtered as its double integral, the displacement (T,), was."""
     lost = np.mean(acceleration[1:-1] - np.diff(displacement, 2) / dt**2)
     return acceleration - lost
 

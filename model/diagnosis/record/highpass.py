@@ -1,9 +1,8 @@
-"""Recordings whose supports are measured by their acceleration alone.
+"""High-pass filter for recordings whose supports are measured by acceleration alone.
 
-Over a whole recording the integral of an acceleration's noise goes by metres.  A filter that passes every signal alike
-leaves the relation between them as it was, so all of them lose what lies well below the slowest mode of the vehicle:
-there a body follows its support, elements hardly deflect, and nothing is told.  What the filter does not know
-at either end of the recording is cut off.
+Over a recording, integrated acceleration noise drifts by metres.  Filtering all signals alike preserves their linear
+relation, so everything well below the slowest mode is removed: there bodies follow their supports, elements hardly
+deflect, and nothing is identifiable.  Transients of the filter at both ends are cut off.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ _ORDER = 4  # of the filter, which runs forwards and backwards
 
 
 def carries_everything(system: System, support: str) -> bool:
-    """Whether all bodies rest on one support and nothing else: they wander with it, and no sensor sees that they do."""
+    """Whether all bodies rest on a single support: they drift with it, which no sensor observes."""
     others = [n for n, source in system.file.inputs.items() if isinstance(source, SupportInput) and n != support]
     grounded = any(GROUND in (element.upper, element.lower) for element in system.file.elements.values())
     absolute = np.isin(system.mechanics.sensor_kind, (DISPLACEMENT, VELOCITY)).any()
@@ -32,12 +31,12 @@ def carries_everything(system: System, support: str) -> bool:
 
 
 def slowest_mode(system: System, held: float) -> float:
-    """Hz, of the motions that a stiffness holds: those above a frequency."""
+    """Frequency of the slowest mode above `held`, Hz, below which modes count as rigid-body motion."""
     return min(mode.frequency for mode in system.mechanics.modes(system.bodies) if mode.frequency > held)
 
 
 def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signals, float]:
-    """Signals without what the integrals of accelerations leave open, and the filter's edge, Hz; 0: nothing is."""
+    """Signals without the drift of integrated accelerations, and the filter's edge, Hz; 0 if none is needed."""
     alone = signals.integrated & signals.accelerated & np.isnan(signals.velocity[0])
     if not alone.any() or carries_everything(system, signals.support_names[0]):
         return signals, 0.0

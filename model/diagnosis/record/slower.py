@@ -1,8 +1,8 @@
-"""Recordings sampled far faster than anything in them moves.
+"""Decimation of recordings that are sampled much faster than their motion requires.
 
-Time and memory of a diagnosis grow with the number of samples, and a sample more tells something only where the sensors
-show more than noise at the frequencies that it adds.  Such recordings are diagnosed at a fraction of their rate, behind
-a linear-phase filter that is the same for every signal and so leaves the relation between them as it was.
+Time and memory of a diagnosis grow with the number of samples, but higher sample rates are only informative if the
+sensors show more than noise at the added frequencies.  Otherwise recordings are decimated behind a linear-phase filter,
+the same for all signals, which preserves their linear relation.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from sprung.model.mechanics import DISPLACEMENT
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-_PASS, _STOP = 0.4, 0.55  # of the new rate: up to where signals pass, from where they are gone
+_PASS, _STOP = 0.4, 0.55  # of the new rate, edges of pass band and stop band
 _DAMPED = 80.0  # dB
 _MOST = 20  # of the old rate over the new one
 
 
 def slower_by(system: System, values: FloatArray, sample_rate: float, rules: RecordRules) -> int:
-    """By which whole number a recording's rate can be divided; 1: not at all.
+    """Integer factor by which a recording's rate can be reduced; 1: not at all.
 
     values (T, C): gap-free columns in the order of `system.channels`; sensors that are absent are NaN.
     """
@@ -54,9 +54,9 @@ def slower_by(system: System, values: FloatArray, sample_rate: float, rules: Rec
 
 
 def slower(values: FloatArray, factor: int) -> tuple[FloatArray, int]:
-    """Columns (T, C) at a fraction of their rate, (T', C), and which sample of the old ones is the first.
+    """Decimated columns (T', C) of columns (T, C), and the index of the old sample that is the first.
 
-    What the filter does not know at either end is cut off; columns of NaN stay so.
+    Transients of the filter at both ends are cut off; columns of NaN are kept.
     """
     taps, beta = kaiserord(_DAMPED, (_STOP - _PASS) * 2 / factor)
     half = taps // 2 + 1

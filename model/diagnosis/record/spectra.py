@@ -24,7 +24,7 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 DEGREE = 5  # of the polynomials: quadratic inputs, integrated twice by a free body
 OVERSAMPLING = 4  # laws with kinks make harmonics beyond the Nyquist frequency of the record
-BAND = 0.30  # of the sample rate: above it anti-alias filters are on their way down, laws' harmonics with them
+BAND = 0.30  # of the sample rate: above it anti-alias filters attenuate
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,7 @@ class Grid:
         return found
 
     def compared_spectra(self, fine_series: FloatArray) -> ComplexArray:
-        """Compared bins of many oversampled series at once, (m, OVERSAMPLING N) -> (m, compared bins).
-
-        Many transforms of contiguous series take less than half the time of as many single ones.
-        """
+        """Compared bins of oversampled series, (m, OVERSAMPLING N) -> (m, compared bins), in one transform."""
         full = scipy.fft.rfft(fine_series, axis=1)
         found: ComplexArray = full[:, self.band] / (OVERSAMPLING * np.sqrt(self.samples))
         return found
@@ -129,7 +126,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class ThinnedGrid(Grid):
-    """Every so many-th of the compared bins but the first: where responses are asked for, not for series."""
+    """A regular subset of the compared bins without zero frequency, for responses only."""
 
     stride: int = 1
 

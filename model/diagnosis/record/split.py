@@ -1,7 +1,7 @@
-"""Where a recording is cut: at quiet moments, into lengths that transform quickly.
+"""Split of a recording at quiet moments, into lengths with fast transforms.
 
-A part is continued around its ends as a parabola and a periodic rest.  What bends faster there than a parabola, a wheel
-on a rail joint for one, is not continued truly and leaves a mark in the first and last samples of the residual.
+A part is represented as a parabola plus a periodic remainder.  Faster motion at its ends, such as a wheel on a rail
+joint, violates this and leaves errors in the first and last samples of the residual.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from scipy.ndimage import uniform_filter1d
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.signals import FloatArray
 
-_REACH_SECONDS, _REACH_SHARE = 0.5, 0.01  # of a cut from where it was meant to be, the smaller of the two
-_NEIGHBOURS = 7  # samples that tell how quiet a moment is
-_PRIMES = (2, 3, 5, 7, 11)  # factors that transforms are quick for
+_REACH_SECONDS, _REACH_SHARE = 0.5, 0.01  # largest shift of a cut, the smaller of the two
+_NEIGHBOURS = 7  # samples for the level around a cut
+_PRIMES = (2, 3, 5, 7, 11)  # factors of lengths with fast transforms
 
 
 def cut(signals: Signals, share: float) -> tuple[Signals, int]:
-    """A recording without its loud ends, and how many of its samples are fitted: about the first `share`."""
+    """A recording cut at quiet moments, and the number of fitted samples: about the first `share`."""
     samples = signals.samples
     reach = int(min(_REACH_SECONDS * signals.sample_rate, _REACH_SHARE * samples))
     loud = _loudness(signals)
@@ -30,7 +30,7 @@ def cut(signals: Signals, share: float) -> tuple[Signals, int]:
 
 
 def _quietest(loud: FloatArray, stretches: list[tuple[int, int]]) -> tuple[int, int]:
-    """The stretch of samples with the quietest ends among those of quick length; if there is none, the first, cut."""
+    """The stretch with the quietest ends among those of fast length; if there is none, the first one, shortened."""
     quick = [(a, b) for a, b in stretches if _is_quick(b - a)]
     if not quick:
         start, stop = stretches[0]

@@ -1,4 +1,4 @@
-"""Which stretch of a recording is diagnosed: without standstill, and no longer than what is affordable."""
+"""Choice of the diagnosed stretch of a recording: without standstill, and of limited length."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sprung.model.signals import BoolArray, FloatArray
 
 
 def standstill(values: FloatArray, least: int, share: float) -> BoolArray:
-    """Samples at which more than a share of the channels (T, C) are in runs of `least` equal values or more, (T,)."""
+    """Mask (T,) of samples at which more than a share of channels (T, C) repeat one value `least` times or more."""
     present = np.isfinite(values).any(axis=0)
     resting = np.zeros(len(values))
     for series in values[:, present].T:
@@ -22,11 +22,11 @@ def standstill(values: FloatArray, least: int, share: float) -> BoolArray:
 
 
 def liveliest(sensors: FloatArray, longest: int) -> tuple[int, int]:
-    """The stretch of `longest` samples in which the sensors (T, S) move most, each over its own mean."""
+    """The stretch of `longest` samples in which the sensors (T, S) move most, relative to their mean power."""
     power = (sensors - np.mean(sensors, axis=0)) ** 2
     mean = power.mean(axis=0)
     level = (power[:, mean > 0] / mean[mean > 0]).mean(axis=1) if np.any(mean > 0) else np.zeros(len(sensors))
-    around = uniform_filter1d(np.minimum(level, 9.0), longest, mode="nearest")  # a single shock is no motion
+    around = uniform_filter1d(np.minimum(level, 9.0), longest, mode="nearest")  # a single shock counts little
     half = longest // 2
     middle = half + int(np.argmax(around[half : len(sensors) - longest + half + 1]))
     return middle - half, middle - half + longest

@@ -1,4 +1,4 @@
-"""What a user can do: likely reasons where nothing fits, what a recording is too short to tell."""
+"""Advice to users: likely reasons if nothing fits, and limits of the recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sprung.model.diagnosis.report.values import deviations
 
 
 def search_ended(limit: str) -> str:
-    """That a search ended at its budget of work or limit of time, and what to do about it."""
+    """Advice if a search ended at its budget of work or time limit."""
     return (
         f"the search ended at its {limit}: more candidates were left to be fitted, and what is still unexplained "
         "may have a name; a shorter recording, or one with fewer samples a second, is searched to the end"
@@ -17,7 +17,7 @@ def search_ended(limit: str) -> str:
 
 
 def nothing_fits(outcome: Outcome, rejected: float) -> str:
-    """That the system file does not describe the recording, and the likeliest reasons."""
+    """Advice if the system file does not describe the recording, with likely reasons."""
     parts = outcome.judgement.parts
     if parts:
         return (
@@ -32,7 +32,7 @@ def nothing_fits(outcome: Outcome, rejected: float) -> str:
 
 
 def likely_reasons(outcome: Outcome) -> list[str]:
-    """Two or three reasons for which nothing fits, by what the record shows."""
+    """Two or three likely reasons why nothing fits."""
     state, before = outcome.investigation, outcome.before
     names, rules = state.signals.sensor_names, state.options.rules.report
     turned, scales = [], []
@@ -58,19 +58,19 @@ def likely_reasons(outcome: Outcome) -> list[str]:
         parameter = state.system.parameters[int(far[0])]
         factor = float(np.exp(state.base.point.theta[int(far[0])]))
         reasons.append(f"{parameter.name} came out {factor:.2g} times nominal, which is not plausible: units, masses")
-    reasons.append("an excitation that nobody measured")
+    reasons.append("an unmeasured excitation")
     reasons.append("channels swapped, sensors elsewhere than stated, or bodies that the file does not have")
     return reasons[:3]
 
 
 def undecided(state: Investigation) -> list[str]:
-    """What the recording is too short or too still to tell."""
+    """Parameters that the recording cannot determine."""
     sigma = deviations(state.system, state.base)
     loose = [p.name for i, p in enumerate(state.system.parameters) if sigma[i] > state.options.rules.report.loose]
     if not loose:
         return []
     shown = ", ".join(loose[:6]) + (f" and {len(loose) - 6} more" if len(loose) > 6 else "")
     return [
-        f"undecided: {shown}: the motion is too small or the recording too short to tell them from their nominal "
-        "values; record longer, faster or on rougher track"
+        f"undecided: {shown}: the motion is too small or the recording too short to distinguish them from nominal; "
+        "record longer, faster or on rougher track"
     ]

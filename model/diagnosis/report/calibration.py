@@ -1,4 +1,4 @@
-"""Gains, zeros and masses within what data sheets leave: told beside the findings, for those who keep instruments."""
+"""Calibration errors within tolerance (gains, zeros, masses), reported beside the findings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SHOWN = 4  # in the summary
 
 
 def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
-    """Those off by more than their deviation, the surest first; a gain that all channels share is told by none."""
+    """Errors above their standard deviation, most significant first; a common gain of all channels is unobservable."""
     state, final = outcome.investigation, outcome.final
     faults = faulty(state)
     indices = [index for index in calibration_indices(state) if index not in faults]
@@ -36,7 +36,7 @@ def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
 
 
 def in_words(calibration: Sequence[IdentifiedLaw]) -> str:
-    """In short; empty where there is nothing to tell."""
+    """Summary; empty without calibration errors."""
     if not calibration:
         return ""
     shown = [f"{one.location} {_name(one)} {p.words()}" for one in calibration[:_SHOWN] for p in one.parameters]
@@ -45,6 +45,6 @@ def in_words(calibration: Sequence[IdentifiedLaw]) -> str:
 
 
 def _name(one: IdentifiedLaw) -> str:
-    """What is off, in a word or two."""
+    """The wrong quantity, in a word or two."""
     (parameter,) = one.parameters
     return f"mass {parameter.name}" if one.effect == MASS_CHANGE.name else parameter.name

@@ -1,4 +1,4 @@
-"""From a finished investigation to the report: numbers with units, fit figures, sentences, arrays for pictures."""
+"""Report of a finished investigation: values with units, figures of fit, sentences, arrays for plots."""
 
 from __future__ import annotations
 
@@ -29,19 +29,22 @@ from sprung.model.laws import StructureLaw
 def compose(outcome: Outcome, record: Recorded) -> Report:
     """The report of an investigation."""
     state, before, after = outcome.investigation, outcome.before, outcome.after
-    said, names = outcome.judgement, state.signals.sensor_names
+    judgement, names = outcome.judgement, state.signals.sensor_names
     findings, calibration = findings_of(outcome), calibration_of(outcome)
     advice = [*state.prepared.notes, *state.notes, *undecided(state)]
-    if said.rejected is not None:
-        advice.insert(0, nothing_fits(outcome, said.rejected))
-    elif said.lost_phase and not state.held.still:
-        advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
-    if said.ended:
-        advice.insert(0, search_ended(said.ended))
+    if judgement.rejected is not None:
+        advice.insert(0, nothing_fits(outcome, judgement.rejected))
+    elif judgement.lost_phase and not state.held.still:
+        advice.insert(
+            0,
+            "the free run loses its phase: the verdict is based on the unmeasured forces, not on its errors",
+        )
+    if judgement.ended:
+        advice.insert(0, search_ended(judgement.ended))
     rules = state.options.rules.verdict
-    explained = said.errors.explained(rules) if state.found else None
-    left = said.errors.unexplained(rules)
-    unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), said.where)
+    explained = judgement.errors.explained(rules) if state.found else None
+    left = judgement.errors.unexplained(rules)
+    unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), judgement.where)
     return Report(
         system=state.system.name,
         recording=RecordingFacts(
@@ -51,13 +54,13 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
             int(record.lost),
             state.prepared.used,
         ),
-        verdict=said.verdict,
+        verdict=judgement.verdict,
         baseline=reported_parameters(state.system, state.base),
         baseline_validation=figures(names, before.per_sensor),
         findings=tuple(findings),
         augmented=reported_parameters(state.system, outcome.final),
         augmented_validation=figures(names, after.per_sensor),
-        noise_floor=figures(names, said.errors.floor),
+        noise_floor=figures(names, judgement.errors.floor),
         localization=state.first.localization(),
         candidates=_candidates(state),
         changes=_changes(outcome),
@@ -68,22 +71,24 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
         noise=_noise(state),
         summary=_summary(outcome, findings, explained, in_words(calibration)),
         advice=tuple(advice),
-        plot_data=plot_data_of(state, before, after, said.floor, [(f.location, f.effect) for f in findings]),
+        plot_data=plot_data_of(state, before, after, judgement.floor, [(f.location, f.effect) for f in findings]),
     )
 
 
 def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[IdentifiedLaw, ...]:
-    """Every law of the final model that has a name and values: those of the file, then those that were found.
+    """Named laws of the final model: those of the file, then those that were found.
 
-    Among them are places of elements that were put right before anything was fitted.
+    Corrected positions of elements are included.
     """
-    told = {(one.location, one.effect) for one in calibration}
+    reported = {(one.location, one.effect) for one in calibration}
     fit, state = outcome.final, outcome.investigation
     count = state.given + (len(state.found) if outcome.judgement.carried else 0)
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
-        moot = index in calibration_indices(state) and (term.location, term.law.name) not in told
-        everywhere = isinstance(term.law, StructureLaw) and term.law.branches is not None  # no file has room for it
+        moot = index in calibration_indices(state) and (term.location, term.law.name) not in reported
+        everywhere = (
+            isinstance(term.law, StructureLaw) and term.law.branches is not None
+        )  # cannot be expressed in a system file
         if term.law.named and not moot and not everywhere:
             values, texts = law_parameters(fit, index, state.options.rules.plausible), formula_of(term)
             found.append(IdentifiedLaw(term.location, term.law.name, values, term.variant, *texts))
@@ -95,7 +100,7 @@ def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[Ide
 
 
 def places_put_right(faults: Iterable[SetupFault]) -> Iterator[IdentifiedLaw]:
-    """Elements at other places than stated, as laws: the system file can take them over."""
+    """Corrected positions of elements, as laws for the system file."""
     for fault in faults:
         law, at = fault.effect.law, fault.site
         if law is not None and fault.value is not None:
@@ -104,7 +109,7 @@ def places_put_right(faults: Iterable[SetupFault]) -> Iterator[IdentifiedLaw]:
 
 
 def _noise(state: Investigation) -> dict[str, float]:
-    """Standard deviation of one sample of every channel, as the model found it."""
+    """Estimated standard deviation of one sample of every channel."""
     system, noise = state.system, state.problem.noise
     levels: dict[str, float] = {}
     support = force = 0
@@ -123,7 +128,7 @@ def _noise(state: Investigation) -> dict[str, float]:
 
 
 def _changes(outcome: Outcome) -> tuple[str, ...]:
-    """Parameters that the nominal structure explains by another value."""
+    """Parameters whose estimates differ from nominal, in words."""
     state, final = outcome.investigation, outcome.final
     rules = state.options.rules.report
     sigma, theta = deviations(state.system, final), final.point.theta
@@ -158,17 +163,17 @@ def _candidates(state: Investigation) -> tuple[CandidateRow, ...]:
 
 
 def _summary(outcome: Outcome, findings: list[Finding], explained: float | None, calibration: str) -> str:
-    said = outcome.judgement
-    beside = f"; {calibration}" if calibration and said.rejected is None else ""
-    if said.verdict == "consistent":
+    judgement = outcome.judgement
+    beside = f"; {calibration}" if calibration and judgement.rejected is None else ""
+    if judgement.verdict == "consistent":
         return f"The nominal structure explains the recording down to the noise{beside}."
-    where = f": {said.where}" if said.where else ""
+    where = f": {judgement.where}" if judgement.where else ""
     text = "; ".join(f.sentence for f in findings) or f"Nothing in the system file fits this recording{where}"
-    if said.carried and said.rejected is None and explained is not None and explained > 0:
-        share = "100" if not said.where else f"{min(100 * explained, 99):.0f}"
+    if judgement.carried and judgement.rejected is None and explained is not None and explained > 0:
+        share = "100" if not judgement.where else f"{min(100 * explained, 99):.0f}"
         text += f"; explains {share} % of the excess error"
-        if said.where:
-            text += f"; still unexplained: {said.where}"
-    if said.ended:
-        text += f"; the search ended at its {said.ended}"
+        if judgement.where:
+            text += f"; still unexplained: {judgement.where}"
+    if judgement.ended:
+        text += f"; the search ended at its {judgement.ended}"
     return f"{text}{beside}."

@@ -1,4 +1,4 @@
-"""Every finding of an investigation: laws, unnamed forces, inputs, wrong set-ups, noise, channels that are stuck."""
+"""Findings of an investigation: laws, unnamed forces, input faults, set-up faults, noise, stuck channels."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from sprung.model.system import System
 
 
 def findings_of(outcome: Outcome) -> list[Finding]:
-    """Findings, the strongest first: a channel that is dead, then by what each explains of chi-square."""
-    state, said = outcome.investigation, outcome.judgement
-    if said.rejected is not None:
+    """Findings, strongest first: stuck channels, then by the reduction of chi-square."""
+    state, judgement = outcome.investigation, outcome.judgement
+    if judgement.rejected is not None:
         return []
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in state.prepared.stuck]
     ranked += [(np.inf, _setup_finding(f)) for f in state.setup_faults]
@@ -33,27 +33,27 @@ def findings_of(outcome: Outcome) -> list[Finding]:
     ]
     ranked += [_out_of_order(outcome, index) for index in faulty(state)]
     ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
-    if said.carried:
+    if judgement.carried:
         ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
     ranked.sort(key=lambda pair: -pair[0])
     findings = [finding for _, finding in ranked]
-    if said.verdict == "unknown_physics" and not any(f.kind is EffectKind.UNLISTED for f in findings):
+    if judgement.verdict == "unknown_physics" and not any(f.kind is EffectKind.UNLISTED for f in findings):
         findings.insert(len(state.setup_faults), _unknown_finding(outcome))
     return findings
 
 
 def _unknown_finding(outcome: Outcome) -> Finding:
-    """What is left above the noise, at the place where it is seen best, without a name."""
-    state, said = outcome.investigation, outcome.judgement
-    here = [candidate for candidate in state.last.candidates if candidate.location == said.place]
+    """The remaining misfit as an unnamed finding, at the place of the highest score."""
+    state, judgement = outcome.investigation, outcome.judgement
+    here = [candidate for candidate in state.last.candidates if candidate.location == judgement.place]
     best = max(here, key=lambda candidate: candidate.score, default=None)
     tried = ""
     if state.found:
         names = " and ".join(f.trial.term.law.name.replace("_", " ") for f in state.found)
         tried = f"; {names} would explain too little of it"
-    left = f"a misfit that no law explains: {said.where}" if said.where else "candidates that were not fitted"
+    left = f"a misfit that no law explains: {judgement.where}" if judgement.where else "candidates that were not fitted"
     return Finding(
-        location=said.place,
+        location=judgement.place,
         effect=UNKNOWN,
         kind=EffectKind.UNLISTED,
         parameters=(),
@@ -64,7 +64,7 @@ def _unknown_finding(outcome: Outcome) -> Finding:
 
 
 def _physics(outcome: Outcome) -> list[Finding]:
-    """Findings of the fitted terms, in the order in which they were found: by evidence."""
+    """Findings of the fitted terms, in the order of the search."""
     state, findings = outcome.investigation, []
     for index, found in enumerate(state.found):
         term = state.fit.point.terms[state.given + index]
@@ -94,16 +94,16 @@ def _physics(outcome: Outcome) -> list[Finding]:
 
 
 def _free(term: Term, parameters: tuple[LawParameter, ...]) -> tuple[LawParameter, ...]:
-    """Parameters without those that nothing depends on: where a body that only heaves is held."""
+    """Parameters that matter: without the position on a body that only heaves."""
     if not any(term.fixed):
         return parameters
     return tuple(one for one, fixed in zip(parameters, term.fixed, strict=True) if not fixed)
 
 
 def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | None]:
-    """The laws at the same place that the recording cannot tell from the chosen one, and what would.
+    """Look-alikes of a law at its place, in words, and the experiment that would distinguish them.
 
-    One that is likelier with values that it cannot have is among them: its values may be what is wrong.
+    A law of more evidence with implausible values is included.
     """
     best = found.trial
     close = [t for t in found.trials if t.evidence > best.evidence - rules.naming_margin]
@@ -120,7 +120,7 @@ def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | No
 def _elsewhere(found: Found, rules: ReportRules) -> tuple[str, ...]:
     """Other places at which the chosen law explains the recording almost equally well.
 
-    Where no force is measured, a body that is heavier than its mass says is the other one lighter.
+    Without measured forces, a heavier body is equivalent to a lighter other one.
     """
     best = found.trial
     near = [t for t in found.trials if t.finished and t.evidence > best.evidence - rules.naming_margin]
@@ -129,7 +129,7 @@ def _elsewhere(found: Found, rules: ReportRules) -> tuple[str, ...]:
 
 
 def _beaten(found: Found) -> dict[str, float]:
-    """Laws that similar data may suggest, as far as they were fitted, with the evidence by which they lost."""
+    """Fitted look-alikes of a law, with the evidence by which they lost."""
     best, beaten = found.trial, dict[str, float]()
     for rival in found.trials:
         name, margin = rival.term.law.name, best.evidence - rival.evidence
@@ -147,7 +147,7 @@ def _experiment(term: Term) -> str:
 
 
 def _out_of_order(outcome: Outcome, index: int) -> tuple[float, Finding]:
-    """A gain or zero that is beyond its tolerance only beside everything that was found, and its rank."""
+    """A gain or zero beyond its tolerance beside all findings, and its rank."""
     term = outcome.investigation.fit.point.terms[index]
     parameters = law_parameters(outcome.final, index, outcome.investigation.options.rules.plausible)
     score = float(((term.parameters[0] - term.law.absent[0]) / parameters[0].std) ** 2)

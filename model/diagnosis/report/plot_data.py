@@ -1,4 +1,4 @@
-"""Arrays that pictures of a report are drawn from (keys in `model.diagnosis.report.report`)."""
+"""Arrays for the plots of a report (keys in `model.diagnosis.report.report`)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _BINS = 41
 def plot_data_of(
     state: Investigation, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
 ) -> dict[str, NDArray[Any]]:
-    """Everything that a picture may need; `order`: place and effect of every finding, as reported."""
+    """All arrays of an investigation; `order`: place and effect of every finding, as reported."""
     rate = state.signals.sample_rate
     start = state.held.split + round(state.signals.start * rate)
     arrays: dict[str, NDArray[Any]] = {
@@ -47,7 +47,7 @@ def plot_data_of(
 
 
 def _of_element(state: Investigation, term: Term, key: str) -> dict[str, NDArray[Any]]:
-    """Motion of the element, the force that was missed before and after, and the law through it."""
+    """Motion of the element, its missing force before and after, and the law."""
     fit, grid = state.fit, state.problem.part.grid
     port = term.port(state.system)
     d_all, v_all = fit.element_motion
@@ -58,8 +58,8 @@ def _of_element(state: Investigation, term: Term, key: str) -> dict[str, NDArray
         law = force_along(term.element_law, term.parameters, d, v, time, fit.forward.element_of(term))
     else:
         law = np.zeros_like(d)
-    after, deviation = latent_force(state, fit, port)
-    before, _ = latent_force(state, state.base, port)
+    after, deviation = missing_force(state, fit, port)
+    before, _ = missing_force(state, state.base, port)
     by_rate = abs(_share(law, v)) > abs(_share(law, d)) if np.any(law) else False
     x = v if by_rate else d
     grid_x = _axis(x, 0.002)
@@ -94,7 +94,7 @@ def _of_element(state: Investigation, term: Term, key: str) -> dict[str, NDArray
 def _surface(
     state: Investigation, term: Term, law: StaticLaw, key: str, d: FloatArray, v: FloatArray
 ) -> dict[str, NDArray[Any]]:
-    """The unnamed force over deflection and rate, with the standard deviation that its weights have."""
+    """The unnamed force over deflection and rate, with its standard deviation."""
     axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
     mesh_d, mesh_v = np.meshgrid(axis_d, axis_v)
     values = np.stack([np.broadcast_to(b, mesh_d.shape) for b in law.values(mesh_d, mesh_v)])
@@ -111,7 +111,7 @@ def _surface(
 
 
 def _of_both(term: Term) -> bool:
-    """Whether a term is a formula in deflection and rate: a curve over one of them says too little of it."""
+    """Whether a term is a formula in both deflection and rate."""
     law = term.law
     if not isinstance(law, ElementLaw) or not law.of_formula or law.memory:
         return False
@@ -119,7 +119,7 @@ def _of_both(term: Term) -> bool:
 
 
 def _formula_map(state: Investigation, term: Term, key: str, d: FloatArray, v: FloatArray) -> dict[str, NDArray[Any]]:
-    """A formula's force over deflection and rate, with the standard deviation that its values have."""
+    """A formula's force over deflection and rate, with its standard deviation."""
     axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
     motion, element = Motion(*np.meshgrid(axis_d, axis_v), 0.0, ()), state.fit.forward.element_of(term)
 
@@ -140,8 +140,8 @@ def _formula_map(state: Investigation, term: Term, key: str, d: FloatArray, v: F
     }
 
 
-def latent_force(state: Investigation, fit: Fit, port: FloatArray) -> tuple[FloatArray, float]:
-    """Force along a port that the residual of a fit asks for, N, (N,), and its standard deviation.
+def missing_force(state: Investigation, fit: Fit, port: FloatArray) -> tuple[FloatArray, float]:
+    """Force along a port that explains the residual of a fit, N, (N,), and its standard deviation.
 
     Bin by bin with a flat prior cut where the sensors see nothing: f = (r^H R^-1 y) / (r^H R^-1 r + prior).
     """

@@ -1,7 +1,7 @@
-"""What a diagnosis says: the data behind the JSON of the contract and behind the pictures.
+"""Reports: the data behind the JSON of the contract and the plots.
 
-`Report.to_dict()` is the public form.  `Report.plot_data` holds the arrays that pictures are drawn from; every key is
-optional.  With T samples of the held-out part, S sensors in the system's order, i the number of a finding:
+`Report.to_dict()` is the public form.  `Report.plot_data` holds the arrays of the plots; every key is optional.
+T: samples of the held-out part; S: sensors in the system's order; i: number of a finding.
 
     validation.time (T,) s, validation.measured / .baseline / .augmented (T, S), validation.noise (S,)
     localization.names (L,), localization.score (L,)
@@ -47,11 +47,11 @@ class LawParameter:
 
     @property
     def determined(self) -> bool:
-        """Whether the recording tells it; not where the deviation exceeds the value: then any other may be true."""
+        """Whether the value is significant: it exceeds its standard deviation."""
         return not self.std > abs(self.value)
 
     def words(self) -> str:
-        """395 +- 6 N, to the digits that the deviation supports."""
+        """As in 395 +- 6 N, rounded by the standard deviation."""
         if not self.determined:
             return "not determined"
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -63,13 +63,13 @@ class LawParameter:
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedLaw:
-    """One law of the final model with its values: what a system file can take over."""
+    """One law of the final model with its values, as in a system file."""
 
     location: str
     effect: str
     parameters: tuple[LawParameter, ...]
     variant: str = ""  # of body laws: the mode's shape, the direction of a force
-    formula: str = ""  # of a force that is known by its formula alone, in d, v and z
+    formula: str = ""  # of a law found by regression, in d, v and z
     memory: str = ""  # the rate of z
 
     def to_dict(self) -> dict[str, Any]:
@@ -93,13 +93,13 @@ class CandidateRow:
     location: str
     effect: str
     score: float  # chi-square of the screening
-    p_value: float  # corrected for everything that was tried
+    p_value: float  # corrected for multiple testing
     delta_bic: float | None = None  # against the baseline; None: screened only
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was left out, where, and how surely."""
+    """One unmodelled effect, its location, and its significance."""
 
     location: str  # element, body, sensor or input
     effect: str  # a word of the contract's table
@@ -109,18 +109,18 @@ class Finding:
     delta_bic: float | None  # against the model without this finding; negative: better; None: nothing compared
     runner_up: tuple[str, float] | None = None  # (effect, delta_bic) of the next best law
     runner_up_location: str | None = None
-    family: str | None = None  # where no single law beats its look-alikes
+    family: str | None = None  # of look-alikes, if none of them is clearly better
     elsewhere: tuple[str, ...] = ()  # other places at which the same law does almost equally well
-    advice: str | None = None  # what would separate the look-alikes
+    advice: str | None = None  # experiment that would distinguish the look-alikes
     sentence: str = ""
-    quoted: tuple[LawParameter, ...] = ()  # what engineers quote of it: yield force, loop area, forces at given rates
-    # evidence by which it beats each law that similar data may suggest and that was fitted
+    quoted: tuple[LawParameter, ...] = ()  # derived values: yield force, loop area, forces at given rates
+    # evidence over each fitted look-alike
     look_alikes: Mapping[str, float] = field(default_factory=dict)
     formula: str = ""  # of a law found by regression, in deflection d, rate v and a hidden state z
     memory: str = ""  # the rate of z
 
     def to_dict(self) -> dict[str, Any]:
-        """Without what there is nothing of."""
+        """As JSON, without empty fields."""
         result: dict[str, Any] = {
             "location": self.location,
             "effect": self.effect,
@@ -146,18 +146,18 @@ class Unexplained:
 
     share: float = 0.0  # mean over sensors
     per_sensor: Mapping[str, float] = field(default_factory=dict)
-    where: str = ""  # in words: place, size and frequencies of what is left
+    where: str = ""  # place, size and frequencies of it, in words
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingFacts:
-    """What was diagnosed."""
+    """The diagnosed recording."""
 
     file: str
     seconds: float
     samples: int
     lost: int
-    used: str = ""  # in words: the stretch that was diagnosed, where that is not all of it
+    used: str = ""  # the diagnosed stretch in words, if not all of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,7 @@ class TrackPoint:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The answer of one diagnosis."""
+    """The result of one diagnosis."""
 
     system: str
     recording: RecordingFacts
@@ -190,14 +190,14 @@ class Report:
     noise_floor: FitFigures
     localization: Mapping[str, float]  # location -> best score
     candidates: tuple[CandidateRow, ...] = ()
-    changes: tuple[str, ...] = ()  # parameters that left their nominal value, in words
+    changes: tuple[str, ...] = ()  # parameters that differ from nominal, in words
     explained: float | None = None  # share of the excess error that the findings explain, held-out part
     unexplained: Unexplained = Unexplained()
     laws: tuple[IdentifiedLaw, ...] = ()  # of the final model, those of the system file first
-    calibration: tuple[IdentifiedLaw, ...] = ()  # gains and zeros that data sheets leave: no findings
-    noise: Mapping[str, float] = field(default_factory=dict)  # channel -> deviation of one sample, as found
+    calibration: tuple[IdentifiedLaw, ...] = ()  # errors within tolerance: not findings
+    noise: Mapping[str, float] = field(default_factory=dict)  # channel -> estimated standard deviation of one sample
     summary: str = ""
-    advice: tuple[str, ...] = ()  # what could not be decided and why
+    advice: tuple[str, ...] = ()  # limits and recommendations
     track: tuple[TrackPoint, ...] = ()  # without measured inputs: natural frequencies over time
     plot_data: dict[str, NDArray[Any]] = field(default_factory=dict)
 
@@ -222,8 +222,8 @@ class Report:
 def plain(value: Any) -> Any:
     """A value as JSON can hold it: dataclasses by their fields; None stands for a number that is not finite."""
     if isinstance(value, LawParameter):
-        told = {"name": value.name, "value": plain(value.value), "std": plain(value.std), "unit": value.unit}
-        return told if value.determined else told | {"determined": False}
+        entry = {"name": value.name, "value": plain(value.value), "std": plain(value.std), "unit": value.unit}
+        return entry if value.determined else entry | {"determined": False}
     if is_dataclass(value):
         return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""A finding in words, with what the missing physics had done to the parameters."""
+"""Sentences of findings, with the bias that the unmodelled effect caused."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
     if isinstance(term.law, StructureLaw) and term.variant:
         words += f", along {term.variant}"
     if finding.family is not None:
-        words = f"{finding.family.replace('_', ' ')}, which this recording does not tell apart; as the first, {words}"
+        words = f"{finding.family.replace('_', ' ')}, which this recording cannot distinguish; as the first, {words}"
     if finding.elsewhere:
         others = " or ".join(place.replace("|", " and ") for place in finding.elsewhere)
-        words += f" (or as much at {others}, which this recording does not tell apart)"
+        words += f" (or as much at {others}, which this recording cannot distinguish)"
     sentence = f"{term.location.replace('|', ' and ')}: {words}"
     found = outcome.investigation.found
     bias = _worst_bias(outcome, "without it" if len(found) == 1 else "without these findings")
-    if bias is not None and found[0].trial.term.key[:2] == term.key[:2]:  # what all of them did together is said once
+    if bias is not None and found[0].trial.term.key[:2] == term.key[:2]:  # the common bias is stated once
         sentence += f"; {bias}"
     return sentence
 
 
 def _told(finding: Finding) -> str:
-    """A formula with its values."""
+    """A formula with its values, in words."""
     values = ", ".join(f"{p.name} = {p.words()}" for p in finding.parameters)
     hidden = f" with z' = {finding.memory}" if finding.memory else ""
     return f"a force that no law of the catalogue explains, by regression {finding.formula}{hidden} ({values})"
 
 
 def _worst_bias(outcome: Outcome, without: str) -> str | None:
-    """What the missing physics had done to the parameter that it shifted most."""
+    """The bias of the parameter that was affected most, in words; None if it is small."""
     state, final = outcome.investigation, outcome.final
     sigma = deviations(state.system, final)
     shift = state.base.point.theta - final.point.theta

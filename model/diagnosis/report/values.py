@@ -1,4 +1,4 @@
-"""Numbers of a fit as they are reported: values with deviations, of parameters and of laws."""
+"""Reported values of parameters and laws, with standard deviations."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def figures(names: Sequence[str], per_sensor: FloatArray) -> FitFigures:
 def deviations(system: System, fit: Fit) -> FloatArray:
     """Standard deviations of the log-ratios, (P,).
 
-    What of an unnamed force belongs to the spring and damper that it works beside is a matter of convention: their
-    own values are uncertain by as much as the whole of it would change them.
+    The division between an unnamed force and the spring and damper beside it is a convention: their values are
+    uncertain by the change that the whole force would cause.
     """
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0))[: len(system.parameters)]
     for i, term in enumerate(fit.forces.terms if fit.forces is not None else ()):
@@ -75,9 +75,9 @@ def law_parameters(fit: Fit, index: int, rules: PlausibleRules = RULES.plausible
     accuracy = np.array([spec.accuracy for spec in term.law.parameters])
     followed = accuracy * np.maximum(size, np.abs(term.scales or size))
     errors = rules.simulated * size
-    # only forces along an element have kinks that are simulated in steps: a sine or a dip is exact in its own time
-    told = _with_errors(block, errors) if isinstance(term.law, ElementLaw) else block + np.diag(errors**2)
-    sigma = np.sqrt(np.maximum(np.diag(told), 0.0) + followed**2)
+    # only forces along elements have kinks between time steps
+    total = _with_errors(block, errors) if isinstance(term.law, ElementLaw) else block + np.diag(errors**2)
+    sigma = np.sqrt(np.maximum(np.diag(total), 0.0) + followed**2)
     hidden = not term.law.named
     return tuple(
         LawParameter(spec.name, float(value), float(s), _unit_at(fit.forward.system, term.location, spec))
@@ -87,20 +87,20 @@ def law_parameters(fit: Fit, index: int, rules: PlausibleRules = RULES.plausible
 
 
 def _with_errors(covariance: FloatArray, errors: FloatArray) -> FloatArray:
-    """Covariance of a law's parameters with errors of each, which the others follow as the recording ties them.
+    """Covariance of a law's parameters with further errors of each, propagated to the correlated others.
 
-    What yields as a power of its deflection has a size in the unit of that power: an exponent that simulation leaves
-    off by a thousandth moves it by five.
+    The coefficient of a power law has the unit of that power: an error of a thousandth in the exponent changes it by
+    five thousandths.
     """
     own = np.diag(covariance)
-    told = own > 0
-    found: FloatArray = np.diag(np.where(told, np.maximum(own, 0.0), errors**2))
-    along = np.where(told, covariance / np.where(told, own, 1.0) * errors, 0.0)  # of every parameter by every error
+    free = own > 0
+    found: FloatArray = np.diag(np.where(free, np.maximum(own, 0.0), errors**2))
+    along = np.where(free, covariance / np.where(free, own, 1.0) * errors, 0.0)  # of every parameter by every error
     return found + np.diag(np.sum(along**2, axis=1))
 
 
 def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
-    """Covariance of a law's parameters with what sampling leaves open of a corner over the rate.
+    """Covariance of a law's parameters with the effect of sampling on a corner over the rate.
 
     A corner of width s is passed in steps of the rate, h each.  The slope there, sech^2(v / s), summed over samples
     instead of integrated is off by 2 x / sinh x cos(phase) of itself, x = pi^2 s / h (Poisson's sum formula).
@@ -114,12 +114,12 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
         return covariance
     width = term.parameters[corner]
     x = min(np.pi**2 * width / passing, 300.0)
-    along = covariance[:, corner] / covariance[corner, corner]  # what the others do when the width is off
+    along = covariance[:, corner] / covariance[corner, corner]  # regression of the others on the width
     found: FloatArray = covariance + 2 * np.outer(along, along) * (width * x / np.sinh(x)) ** 2
     return found
 
 
 def formula_of(term: Term) -> tuple[str, str]:
-    """Text of the force and of its hidden state's rate, of a law that is known by them alone; empty for others."""
+    """Formulas of the force and of its hidden state's rate; empty for laws of the catalogue."""
     law = term.law
     return (law.formula, law.memory_formula) if isinstance(law, ElementLaw) and law.of_formula else ("", "")

@@ -1,7 +1,7 @@
-"""Candidates at bodies: another mass, an elastic mode, a periodic force that nobody measured.
+"""Candidates at bodies: another mass, an elastic mode, an unmeasured periodic force.
 
-An elastic mode and a periodic force are narrow: whole grids of their frequencies are scored at once, since a column
-is a fixed spectrum times a scalar function h(w) of the trial, so that all projections are one matrix product.
+Elastic modes and periodic forces are narrow-band, so grids of frequencies are scored.  A column is a fixed spectrum
+times a scalar function h(w) of the trial, and all projections are one matrix product.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sprung.model.signals import FloatArray
 
 
 def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
-    """The best trial of every body law at every body, and how many were tried."""
+    """The best trial of every body law at every body, with the number of trials."""
     system = projector.problem.system
     for law in laws:
         if not isinstance(law, BodyLaw):
@@ -51,7 +51,7 @@ def _mass(projector: Projector, law: BodyLaw, index: int, name: str) -> Candidat
 
 
 def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterator[tuple[Candidate, int]]:
-    """Elastic modes of a body, per shape: first order in the participation."""
+    """The best elastic mode of a body per shape, to first order in its participation."""
     fit, grid = projector.fit, projector.grid
     system = projector.problem.system
     plant = fit.forward.plant
@@ -96,10 +96,10 @@ def _mode_grid(sample_rate: float, rules: ScreeningRules) -> tuple[FloatArray, F
 
 
 def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Candidate, int]:
-    """The strongest line of a force on one degree of freedom of a body.
+    """The strongest spectral line of a force on one degree of freedom of a body.
 
-    At a bin's frequency a sine fills that bin; half way between two it fills both, in opposite phase.  Scores are
-    divided by their local median where that is more than chance, so that broad misfits do not pass for lines.
+    A sine at the frequency of a bin fills that bin, half way between two it fills both in opposite phase.  Scores are
+    normalised by their local median where it exceeds noise, so that broadband misfits are not taken for lines.
     """
     grid = projector.grid
     system = projector.problem.system
@@ -135,7 +135,7 @@ def _local_median(scores: FloatArray, reach: int) -> FloatArray:
 def _refined_line(
     projector: Projector, law: BodyLaw, name: str, variant: str, bin_number: float, rough: float
 ) -> Candidate:
-    """Frequency, amplitude and phase of a line by exact columns near the bin."""
+    """A line with frequency, amplitude and phase refined by exact columns near the bin."""
     grid = projector.grid
     dof = projector.problem.system.mechanics.dofs.index(f"{name}.{variant}")
     time = grid.start + grid.time + CLOCK_LEAD

@@ -1,4 +1,4 @@
-"""Candidates at elements: the best shape of every law, and static forces without a name."""
+"""Candidates at elements: the best shape of every law, and unnamed (non-parametric) static forces."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sprung.model.signals import FloatArray
 
 @dataclass(frozen=True)
 class TrialElement:
-    """One element, or a pair, of a fit as trial forces see it."""
+    """Motion and response of one element, or of a pair, for trial forces."""
 
     projector: Projector
     location: str
@@ -34,13 +34,13 @@ class TrialElement:
 
     @classmethod
     def of(cls, projector: Projector, location: str) -> TrialElement:
-        """Of a fit's projector."""
+        """Of an element or a pair."""
         elements = projector.problem.system.elements
         return cls.along(projector, location, np.eye(len(elements))[elements.index(location)])
 
     @classmethod
     def along(cls, projector: Projector, location: str, port: FloatArray) -> TrialElement:
-        """Of a fit's projector, along a port (E,): one element, or those of a pair."""
+        """Along a port (E,)."""
         d, v = (motion @ port for motion in projector.fit.element_motion)
         element = projector.fit.forward.element_at(location)
         thin = slice(None, None, OVERSAMPLING)
@@ -73,13 +73,13 @@ class TrialElement:
 
     @cached_property
     def _rate_spectrum(self) -> ComplexArray:
-        """Of the rate over the compared bins, (F,)."""
+        """Spectrum of the rate over the compared bins, (F,)."""
         found: ComplexArray = self.projector.grid.compared_spectra(self.rate[None])[0]
         return found
 
 
 def element_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
-    """The best shape of every element law at every element or pair, and how many shapes were tried."""
+    """The best shape of every element law at every element or pair, with the number of trials."""
     system = projector.problem.system
     asked = [(law, "") for law in laws if isinstance(law, ElementLaw) and law.screened]
     asked += [(law.wider, WIDER) for law, _ in asked if law.wider is not None and law.wider.screened]
@@ -117,7 +117,7 @@ def _best_shape(motion: TrialElement, nothing: Term) -> tuple[Candidate, int]:
 
 
 def _unnamed(motion: TrialElement) -> Iterator[tuple[Candidate, int]]:
-    """Static forces without a name at one element."""
+    """Unnamed static forces at one element."""
     for name, basis in trials().items():
         law = static_law(basis, motion.seen)
         scales = tuple(q.typical(motion.seen) for q in law.parameters)
@@ -128,13 +128,13 @@ def _unnamed(motion: TrialElement) -> Iterator[tuple[Candidate, int]]:
 
 
 def _admissible(law: ElementLaw, trial: FloatArray, amplitude: float) -> bool:
-    """Whether the amplitude found has the law's sign."""
+    """Whether an amplitude has the sign of the law."""
     if law.strength is None:
         return amplitude > 0
     value = float(law.scaled(list(trial), amplitude)[law.strength])
     spec = law.parameters[law.strength]
     absent = law.absent[law.strength]
-    # More than the bound says that the element was misread; only the other sign is none of the law's.
+    # beyond the bound the element may be misestimated; only the wrong sign excludes the law
     return (
         spec.low <= value <= spec.high
         or (value < absent and spec.low < absent)

@@ -1,4 +1,4 @@
-"""Groups of candidates that are screened alike: one row each, what is particular to it in the row."""
+"""Families of candidates with a common score test, one entry each."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def _nothing(rules: ScreeningRules) -> float:
 
 @dataclass(frozen=True)
 class Family:
-    """One group of score tests.  Corrections for what was tried are made inside a family, then over the families."""
+    """One family of score tests.  Multiple testing is corrected within a family, then over the families."""
 
     name: str
     freedom: int | None = 1  # of the chi-square of its score; None: one per parameter of the candidate

@@ -1,6 +1,6 @@
-"""What repeats itself under a wheel: all frequencies and phases of a periodic movement at once.
+"""Periodic support motion (wheel flats, rail joints): scores of all frequencies and phases at once.
 
-The residual is taken back to the support, r -> z(t).  For a movement w(t) = Re sum_n W_n e^{2 pi j n (f t - p)} the
+The residual is mapped back to the support, r -> z(t).  For a movement w(t) = Re sum_n W_n e^{2 pi j n (f t - p)} the
 product with the residual is sum_n Re W_n e^{-2 pi j n p} conj(Z(n f)): it needs nothing but the transform Z of z on a
 fine axis of frequencies, and a transform over n for the phases p.
 """
@@ -28,7 +28,7 @@ _MEDIAN = 1.386  # of chi-square with two degrees of freedom
 
 
 def harmonic_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
-    """The best movement of every such law at every support or axle, and how many were tried."""
+    """The best movement of every such law at every support or axle, with the number of trials."""
     system = projector.problem.system
     for law in laws:
         if isinstance(law, SupportLaw):
@@ -60,7 +60,7 @@ def _products(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Fundamentals (m,) in Hz, products with the residual (m, phases) and squares (m,) of movements of unit depth.
 
-    Both are divided by how much stronger than noise the residual is around every bin.
+    Both are normalised by the local level of the residual over noise.
     """
     scores = np.abs(channel.product) ** 2 / np.maximum(channel.size, 1e-300)
     colour = np.maximum(1.0, median_filter(scores, size=2 * rules.reach + 1, mode="nearest") / _MEDIAN)
@@ -83,7 +83,7 @@ def _products(
 def _refined(
     grid: Grid, law: SupportLaw, channel: ScalarResponse, frequency: float, phase: float
 ) -> tuple[tuple[float, float, float], float]:
-    """Depth, frequency and phase, and the statistic, by exact columns around a rough find."""
+    """Depth, frequency and phase, and the statistic, refined by exact columns."""
     time = grid.start + grid.time + CLOCK_LEAD
     middle = float(time.mean())  # a frequency turns the phase about the middle
     shifts = phase + np.linspace(-1, 1, 5) / _PHASES

@@ -1,4 +1,4 @@
-"""Where laws may be: elements, pairs of elements, axles."""
+"""Locations of laws: elements, pairs of elements, axles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sprung.model.system import System
 
 
 def places(system: System, law: ElementLaw) -> list[str]:
-    """Locations of an element law: elements, or pairs of elements between the same bodies at the same x."""
+    """Locations of an element law: elements, or pairs between the same bodies at the same x."""
     elements = system.file.elements
     if law.where == "element":
         return [name for name in elements if not law.at or name in law.at]

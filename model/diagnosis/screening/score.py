@@ -1,9 +1,9 @@
-"""Every law at every place with every shape, as a score test on the residual of a fit.
+"""Score tests of all laws, places and shapes on the residual of a fit.
 
-A candidate's force along the fitted motion, taken through the fitted system to the sensors and whitened, is a column
-c of unit-noise numbers, like the residual r and the fit's own sensitivities J.  With everything that J can imitate
-projected out, c' = c - Q Q^T c, the statistic (c'^T r)^2 / |c'|^2 is chi-square with one degree of freedom when the
-candidate is absent (Rao's score test), whatever the parameters have absorbed.
+The whitened response of the sensors to a candidate's force along the fitted motion is a column c, in units of noise
+like the residual r and the Jacobian J of the fit.  After projection onto the complement of J, c' = c - Q Q^T c, the
+statistic (c'^T r)^2 / |c'|^2 is chi-square with one degree of freedom if the candidate is absent (Rao's score test),
+whatever the parameters have absorbed.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from sprung.model.signals import FloatArray
 class Candidate:
     """A law at a place, as screened."""
 
-    term: Term  # with the amplitude that the screening found
+    term: Term  # with the amplitude of the screening
     score: float  # chi-square
     family: Family
-    beyond: float = 1.0  # the strength that the screening asks for over the most that the law allows, at least 1
-    start: Point | None = None  # where a fit of it begins, if not beside the model that was screened
+    beyond: float = 1.0  # estimated strength over the law's largest admissible one, at least 1
+    start: Point | None = None  # initial values of its fit, if not those of the screened model
 
     @property
     def freedom(self) -> int:
@@ -41,11 +41,11 @@ class Candidate:
 
     @property
     def p_single(self) -> float:
-        """Chance of such a score if this alone had been tried."""
+        """p-value of the score as a single test."""
         return float(chdtrc(self.freedom, self.score))
 
     def strength(self, rules: ScreeningRules = RULES.screening) -> float:
-        """Score less what chance gives: comparable between families."""
+        """Score less its level under noise alone: comparable between families."""
         return self.score - rules.per_freedom * (self.freedom - 1) - self.family.look_elsewhere(rules)
 
     @property
@@ -59,17 +59,17 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Screening:
-    """All candidates, best first, with p-values corrected for everything that was tried."""
+    """All candidates, best first, with p-values corrected for multiple testing."""
 
     candidates: tuple[Candidate, ...]  # the best shape of every law at every place
-    tests: dict[Family, int]  # how many were tried
+    tests: dict[Family, int]  # number of tests
 
     def tried(self, family: Family) -> int:
         """Bonferroni's number: tests of the family, times the families."""
         return self.tests[family] * len(self.tests)
 
     def p_value(self, candidate: Candidate) -> float:
-        """Corrected for everything that was tried."""
+        """p-value, corrected for multiple testing."""
         return float(min(1.0, candidate.p_single * self.tried(candidate.family)))
 
     def localization(self) -> dict[str, float]:
@@ -80,7 +80,7 @@ class Screening:
 
 
 class Projector:
-    """Residual and candidates with the fit's sensitivities projected out."""
+    """Residual and columns of candidates, projected onto the complement of the fit's Jacobian."""
 
     def __init__(self, problem: Problem, fit: Fit, project: bool = True) -> None:
         jacobian = fit.jacobian if project else fit.jacobian[:, -len(fit.point.state) :]
@@ -104,19 +104,19 @@ class Projector:
 
     @cached_property
     def score_offset(self) -> FloatArray:
-        """What the residual leans on J at the end of a fit whose residual's covariance depends on the parameters.
+        """Component of the residual in the span of J, if its covariance depends on the parameters.
 
-        Such a fit ends at J^T r = d log det R / 2, not at zero.
+        The optimum of such a fit is J^T r = d log det R / 2, not zero.
         """
         slope = np.concatenate([self.fit.log_det_slope, np.zeros(len(self.fit.point.state))])[-len(self.kept) :]
         score_offset = np.linalg.lstsq(self.r.T, slope[self.kept] / self.scale[self.kept], rcond=1e-9)[0]
         return np.asarray(self.q @ score_offset[self.strong] / 2)
 
     def spread(self, column: FloatArray, change: ComplexArray) -> float:
-        """What the residual's determinant adds to the product of a column and the residual.
+        """Correction to the product of a column and the residual from the derivative of the log determinant.
 
-        change (F, S, inputs): of what the sensors show of the inputs.  Forces along elements need none of it: what
-        the determinant makes of them is what it makes of the spring and damper that they resemble.
+        change: derivative (F, S, inputs) of the response to the inputs.  Not needed for forces along elements, for
+        which the determinant acts as on the spring and damper that they resemble.
         """
         if not self.problem.process_noise:
             return 0.0
@@ -148,11 +148,11 @@ class Projector:
         return response
 
     def seen_of(self, port: FloatArray, force: ComplexArray) -> FloatArray:
-        """What the residual loses to a force (F,) along a port, (2 F S,)."""
+        """Reduction of the residual by a force (F,) along a port, (2 F S,)."""
         return self.pack(self.of_port(port) * force[:, None])
 
     def score(self, column: FloatArray, more: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
-        """Statistic and amplitude of a column; `more`: product with, and square of, residuals outside the sensors."""
+        """Statistic and amplitude of a column; `more`: the same of residuals outside the sensors (product, square)."""
         inside = self.q.T @ column
         size = float(column @ column)
         left = size - float(inside @ inside)
@@ -164,13 +164,13 @@ class Projector:
 
 
 class ScalarResponse:
-    """Scores of columns that are one response (F, S) times a scalar spectrum h (F,): all trials at once."""
+    """Scores of columns of the form response (F, S) times scalar spectrum h (F,), for all trials at once."""
 
     def __init__(self, projector: Projector, response: ComplexArray) -> None:
         weighted = (response * projector.grid.weight[:, None]).conj()
         self.product = np.einsum("fs,fs->f", weighted, projector.complex_residual)
         self.size = np.sum(np.abs(weighted) ** 2, axis=1)
-        # the same for trials as real rows (2 F,): half the work of complex products whose real part is wanted
+        # as real rows (2 F,), which halves the work of the real part of complex products
         self._product = np.concatenate([self.product.real, self.product.imag])
         self._size = np.concatenate([self.size, self.size])
         inside = np.einsum("fs,fsq->fq", weighted, projector.complex_q, optimize=True)

@@ -1,4 +1,4 @@
-"""All laws at all places, screened on the residual of a fit."""
+"""Screening of all laws at all places on the residual of a fit."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ GROUPS = (element_candidates, harmonic_candidates, body_candidates, structure_ca
 
 
 def screen(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = True) -> Screening:
-    """Score every candidate on the residual of a fit, by the smallest chance of such a score first."""
+    """Scores of all candidates on the residual of a fit, by p-value."""
     if problem.memory is None:
         return _screened(problem, fit, laws, project)
     key = "screen", id(fit), problem.rules.screening, tuple(law.name for law in laws), project
-    # the fit is kept with it: an identity is given anew once its owner is gone
+    # the cache holds the fit, so that its id stays unique
     return problem.memory.recall(key, lambda: (fit, _screened(problem, fit, laws, project)))[1]
 
 

@@ -1,8 +1,8 @@
-"""Candidates of the structure: a connection, a mass that hangs on a body, an element at another place.
+"""Structural candidates: a connection, a mass suspended from a body, an element at another place.
 
-What a part does at a point (x, y) of its bodies is a quadratic form in w = (1, x, y): its deflection is w . s and its
-force pushes along w . r, so that a column is sum_ij w_i w_j (r_i s_j).  The six distinct columns are taken through the
-system and projected once; then every place is scored in closed form.
+The effect of a part at a point (x, y) is a quadratic form in w = (1, x, y): its deflection is w . s and its force acts
+along w . r, so that a column is sum_ij w_i w_j (r_i s_j).  The six distinct columns are computed and projected once;
+every place is then scored in closed form.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 _PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of 1, x, y
-_PLACES = {"x": 9, "y": 5}  # along an axis that turns
-_FAINT = 1e-3  # a share in which every law is linear
+_PLACES = {"x": 9, "y": 5}  # trial places along an axis with rotation
+_FAINT = 1e-3  # relative strength at which all laws are linear
 _SEEN = 1e-6  # of a column's square, left by the projection
 
 
 def structure_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
-    """The best trial of every law of the structure at every place, and how many were tried."""
+    """The best trial of every structural law at every place, with the number of trials."""
     system = projector.problem.system
     for law in laws:
         if not isinstance(law, StructureLaw):
@@ -51,7 +51,7 @@ def structure_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterato
 
 
 def _of_element(projector: Projector, law: StructureLaw, name: str) -> Iterator[tuple[Candidate, int]]:
-    """What an element has beside its spring and damper, or the places at which it may sit."""
+    """Parts parallel to an element, or other positions of it."""
     system = projector.problem.system
     if law.along is None:
         for axis in law.variants:
@@ -62,7 +62,7 @@ def _of_element(projector: Projector, law: StructureLaw, name: str) -> Iterator[
 
 
 def _of_all_springs(projector: Projector, law: StructureLaw) -> Iterator[tuple[Candidate, int]]:
-    """What every spring has together."""
+    """Laws common to all springs."""
     system, grid, structure = projector.problem.system, projector.grid, projector.fit.forward.plant.structure
     springs = [name for e, name in enumerate(system.elements) if structure.stiffness[e] > 0]
     term = Term(law, "|".join(springs), (_FAINT, *law.absent[1:]))
@@ -78,7 +78,7 @@ def _of_all_springs(projector: Projector, law: StructureLaw) -> Iterator[tuple[C
 
 
 def _beside(projector: Projector, law: StructureLaw, along: int, name: str) -> Candidate:
-    """A force that goes with a derivative of an element's deflection."""
+    """A force proportional to a derivative of an element's deflection."""
     fit, grid = projector.fit, projector.grid
     band, element = grid.band, projector.problem.system.elements.index(name)
     rate = fit.motions.rate[band, element]
@@ -91,9 +91,9 @@ def _beside(projector: Projector, law: StructureLaw, along: int, name: str) -> C
 
 
 def unconnected(system: System) -> Iterator[tuple[str, str]]:
-    """Pairs of bodies, and of a body and a support or the ground that no element joins yet.
+    """Pairs of bodies, and of a body and a support or the ground, without an element between them.
 
-    Beside one, a connection is its own stiffness.
+    A connection parallel to an element is not distinguishable from its stiffness.
     """
     yield from combinations(system.bodies, 2)
     joined = {frozenset((element.upper, element.lower)) for element in system.file.elements.values()}
@@ -103,20 +103,20 @@ def unconnected(system: System) -> Iterator[tuple[str, str]]:
 
 
 def _knows_ground(system: System) -> bool:
-    """Whether recordings tell where bodies are above the ground, and not just above a support that carries them all."""
+    """Whether motion relative to ground is observable, and not only relative to a single support of all bodies."""
     source = system.file.inputs[supports(system)[0]] if supports(system) else None
     accelerated = isinstance(source, SupportInput) and {*source.measured} == {"acceleration"}
     return not (accelerated and carries_everything(system, supports(system)[0]))
 
 
 def turns(system: System, element: str, axis: str) -> bool:
-    """Whether an element's place along an axis matters: one of its ends is at a body that turns."""
+    """Whether an element's position along an axis matters: a body at one of its ends rotates."""
     ends = system.file.elements[element]
     return any(f"{end}.{AXES[axis]}" in system.mechanics.dofs for end in (ends.upper, ends.lower))
 
 
 def _places(system: System, names: tuple[str, ...]) -> tuple[FloatArray, tuple[bool, ...]]:
-    """Places (m, 2) at which bodies may be held, and whether x and y matter at all."""
+    """Trial places (m, 2) at bodies, and whether x and y matter."""
     of = [e.position or (0.0, 0.0) for e in system.file.elements.values() if {e.upper, e.lower} & {*names}]
     bodies = [name for name in names if name in system.file.bodies]
     of += [system.file.bodies[name].position for name in bodies]
@@ -140,7 +140,7 @@ def _forms(places: FloatArray, free: tuple[bool, ...]) -> tuple[list[tuple[int, 
 
 
 def _connection(projector: Projector, law: StructureLaw, one: str, other: str) -> tuple[Candidate, int]:
-    """The best place of a spring-damper between two bodies, or a body and a support or the ground."""
+    """The best place of a spring-damper between two bodies, or between a body and a support or the ground."""
     system, fit, band = projector.problem.system, projector.fit, projector.grid.band
     location = f"{one}|{other}"
     places, free = _places(system, (one, other))
@@ -167,7 +167,7 @@ def _connection(projector: Projector, law: StructureLaw, one: str, other: str) -
 
 
 def _held_at(system: System, body: str, support: str) -> FloatArray:
-    """Where a support is held already, (1, 2)."""
+    """Position of a support, (1, 2)."""
     at = [e.position for e in system.file.elements.values() if support in (e.upper, e.lower) and e.position]
     return np.array(at[:1] or [system.file.bodies[body].position], dtype=float)
 
@@ -183,7 +183,7 @@ def _support_motion(projector: Projector, support: int) -> ComplexArray:
 
 
 def _sizes(system: System) -> tuple[float, float]:
-    """Stiffness and damping that matter in a system."""
+    """Typical stiffness and damping of a system."""
     mechanics = system.mechanics
     sizes = [values[values > 0] for values in (mechanics.stiffness, mechanics.damping)]
     return tuple(float(np.median(size)) if len(size) else 1.0 for size in sizes)  # type: ignore[return-value]
@@ -192,7 +192,7 @@ def _sizes(system: System) -> tuple[float, float]:
 def _columns(
     projector: Projector, rows: FloatArray, along: ComplexArray, pairs: list[tuple[int, int]]
 ) -> list[FloatArray]:
-    """Answers to the parts w_i w_j of a pull along rows (3, n) that grows with `along` (F, 3), each (2 F S,)."""
+    """Responses to the parts w_i w_j of a force along rows (3, n) proportional to `along` (F, 3), each (2 F S,)."""
     push = -(projector.of_load @ rows.T)  # (F, S, 3)
     found = []
     for i, j in pairs:
@@ -237,9 +237,9 @@ def _nonnegative(projector: Projector, columns: FloatArray, forms: FloatArray) -
 
 
 def _suspended(projector: Projector, law: StructureLaw, name: str) -> tuple[Candidate, int]:
-    """The best place, frequency and damping of a mass that hangs on a body: first order in the mass.
+    """The best place, frequency and damping of a suspended mass, to first order in the mass.
 
-    It pulls its point by m T(w) times that point's acceleration, T = (w0^2 + 2 j z w0 w) / (w0^2 - w^2 + 2 j z w0 w).
+    Its force is m T(w) times that point's acceleration, T = (w0^2 + 2 j z w0 w) / (w0^2 - w^2 + 2 j z w0 w).
     """
     system, fit, grid = projector.problem.system, projector.fit, projector.grid
     (site,) = sites_of(system.file, name)
@@ -277,7 +277,7 @@ def _trials(sample_rate: float, rules: ScreeningRules) -> FloatArray:
 
 
 def _transfer(trials: FloatArray, omega: FloatArray) -> ComplexArray:
-    """Motion of the hanging mass over its point's, (trials, F)."""
+    """Transfer function from the point of suspension to the mass, (trials, F)."""
     w0, ratio = 2 * np.pi * trials[:, :1], trials[:, 1:]
     carried = w0**2 + 2j * ratio * w0 * omega
     return np.asarray(carried / (carried - omega**2))
@@ -288,7 +288,7 @@ def _forms_of_trials(
 ) -> tuple[FloatArray, FloatArray]:
     """Gram matrices (t, p, p) and products with the residual (t, p) of responses (p, F, S) times transfers (t, F).
 
-    What the projection leaves of a column by less than rounding allows has no size.
+    Columns that the projection reduces to rounding errors count as zero.
     """
     power = np.abs(transfer) ** 2
     conj = transfer.conj()
@@ -305,7 +305,7 @@ def _forms_of_trials(
 
 
 def _moved(projector: Projector, law: StructureLaw, name: str, axis: str) -> Iterator[tuple[Candidate, int]]:
-    """An element elsewhere along an axis: its force has another lever, and its deflection another share of rotation."""
+    """An element at another position along an axis: lever arm and deflection change."""
     system, fit, grid = projector.problem.system, projector.fit, projector.grid
     band, plant = grid.band, fit.forward.plant
     element = system.elements.index(name)

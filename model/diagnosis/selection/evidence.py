@@ -119,9 +119,9 @@ def occam_cost(
     widths = [rules.log_width if log else rules.widths * scale for log, scale in zip(logarithmic, scales, strict=True)]
     variance = np.diag(covariance)
     free = np.isfinite(variance) & (variance > 0)
-    told = covariance[np.ix_(free, free)]
+    determined = covariance[np.ix_(free, free)]
     prior = np.diag(np.array(widths)[free] ** 2 / (2 * np.pi))
-    return max(0.0, _log_det(told + prior) - _log_det(told))
+    return max(0.0, _log_det(determined + prior) - _log_det(determined))
 
 
 def _log_det(covariance: FloatArray) -> float:

@@ -200,7 +200,7 @@ def test_a_rod_that_does_not_move_is_too_still_to_decide() -> None:
         diagnose(system(), RigRecording(values))
 
 
-def test_a_foundation_that_hardly_moves_is_taken_for_ground() -> None:
+def test_a_foundation_that_hardly_moves_is_treated_as_ground() -> None:
     _, d, v = sweep(8.0)
     random = np.random.default_rng(2)
     force = K * d + C * v + 60 * np.tanh(v / 1e-3) + random.standard_normal(len(d))
@@ -223,7 +223,7 @@ sensors:
 """)
     found = diagnose(framed, RigRecording(np.column_stack([d, force])))
     assert found.verdict == "missing_physics"
-    assert any("taken for ground" in note for note in found.advice)
+    assert any("treated as ground" in note for note in found.advice)
 
 
 def test_the_deviations_cover_the_truth() -> None:

@@ -60,14 +60,14 @@ def test_errors_of_the_program_are_no_divergence(clean: tuple[Problem, Fit]) -> 
         try_optimise(problem, Point(fit.point.theta, (broken,), fit.point.state), 3)
 
 
-def test_numbers_that_diverge_from_the_start_are_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_divergence_from_the_start_is_reported_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def singular(*args: object, **kwargs: object) -> NoReturn:
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
     monkeypatch.setattr("sprung.model.diagnosis.fit.baseline.optimise", singular)
     system = quarter_car()
     signals = prepare(system, simulate(seconds=12).values, 100.0).signals
-    with pytest.raises(DiagnosisError, match="numbers diverge; check units"):
+    with pytest.raises(DiagnosisError, match="estimates diverge; check units"):
         baseline(system, signals, declared_noise(system, signals), 700)
 
 

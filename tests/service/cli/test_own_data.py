@@ -124,7 +124,7 @@ def test_times_in_ms_that_nobody_declared_are_an_error(tmp_path: Path, capfd: py
     for command in ("replay", "diagnose"):
         assert main([command, str(tmp_path / "ride.csv"), "--system", str(tmp_path / "car.yaml")]) == 2
         err = capfd.readouterr().err
-        assert "if its times are in ms, say `time: {unit: ms}` in the system file" in err
+        assert "if its times are in ms, set `time: {unit: ms}` in the system file" in err
         assert len(err.splitlines()) == 1
 
 
