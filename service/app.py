@@ -47,7 +47,7 @@ DESCRIPTION = (
 )
 
 VALUE_BYTES = 40  # of one value of a window as JSON, generously: a minute of a vehicle without inputs is 1.5 MB
-OTHER_BYTES = 1 << 17  # of bodies that hold no samples: what is wrong in them is found in milliseconds
+OTHER_BYTES = 1 << 17  # of bodies that hold no samples: their errors are found in milliseconds
 
 
 _PARTS = (

@@ -80,7 +80,7 @@ def back_up(settings: Settings, target: Path) -> Backup:
 def restore(settings: Settings, source: Path) -> Backup:
     """Put a back-up into a data folder that has no store; every file is checked before anything is in its place.
 
-    Raises UserError for what is no whole back-up, and for a folder that is in use or holds a store.
+    Raises UserError for an incomplete back-up, and for a folder that is in use or holds a store.
     """
     target = _store_file(settings)
     with held(settings.data_dir):
@@ -96,7 +96,7 @@ def restore(settings: Settings, source: Path) -> Backup:
             for name in FOLDERS:
                 _merge(part / name, settings.data_dir / name)
             target.parent.mkdir(parents=True, exist_ok=True)
-            for suffix in ("-wal", "-shm"):  # of a store that is gone: they would be taken for this one's
+            for suffix in ("-wal", "-shm"):  # left by a former store: they would be applied to this one
                 target.with_name(target.name + suffix).unlink(missing_ok=True)
             (part / STORE).replace(target)  # last: a restoration that was cut short has no store, and can be begun anew
             sync_folder(target.parent)

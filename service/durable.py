@@ -1,4 +1,4 @@
-"""Files that are still there, and whole, after a power cut: the disk is asked to keep them before anybody is told."""
+"""Files that survive a power cut: they are synced to disk before success is reported."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def sync_file(path: Path) -> None:
-    """Have the disk keep what was written to a file."""
+    """Sync a file to disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -19,7 +19,7 @@ class Busy(RuntimeError):
 
 
 class TooManyOfOne(Busy):
-    """One client has what it may have of something that others need, too."""
+    """One client has reached its share of a common resource."""
 
 
 class NoSpace(RuntimeError):

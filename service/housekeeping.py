@@ -1,4 +1,4 @@
-"""Every hour: forget what is older than the settings keep."""
+"""Hourly deletion of data that are older than the settings keep."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sprung.service.times import NANOSECONDS, now_ns
 log = logging.getLogger("sprung.housekeeping")
 PERIOD_SECONDS = 3600.0
 DAY = 86_400 * NANOSECONDS
-LONGEST_PAUSE = DAY  # by which a pause of the service ages what is kept
+LONGEST_PAUSE = DAY  # by which a pause of the service ages stored data
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ class Housekeeping:
             self._thread.join()
 
     def clear_leftovers(self) -> list[str]:
-        """Delete what a process that died left half written; call it before anything is accepted.  The names."""
+        """Delete incomplete files of a killed process, before anything is accepted.  Returns their names."""
         with self._store.read() as connection:
             kept = work.stored_files(connection)
         left = [path for path in _entries(self._settings.uploads) if path.name not in kept]
@@ -127,7 +127,7 @@ class Housekeeping:
         return [path.name for path in left]
 
     def once(self, now: int, keep: bool = True) -> retention.Forgotten:
-        """One round, as if it were `now`, ns since epoch; keep: False only tells what would be forgotten."""
+        """One round, as if it were `now`, ns since epoch; keep: False only lists what would be deleted."""
         settings = self._settings
         limits = retention.RetentionLimits(
             now - round(settings.retention_windows_days * DAY),
@@ -160,7 +160,7 @@ class Housekeeping:
         while True:
             try:
                 self.once(self.clock.now())
-            except Exception:  # whatever it is, it may be over in an hour, and nobody else forgets old data
+            except Exception:  # it may be over in an hour, and nothing else deletes old data
                 log.exception("housekeeping failed; it tries again in an hour")
             if self._stopping.wait(PERIOD_SECONDS):
                 return

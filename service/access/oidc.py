@@ -1,7 +1,7 @@
 """OpenID Connect: people sign in where their organisation does, and programs send the access tokens that it gives.
 
 The authorization code flow with PKCE, state and nonce (OpenID Connect Core 1.0, RFC 7636, RFC 9700); signatures are
-checked against the provider's published keys, with asymmetric algorithms alone.  What somebody may do follows from
+checked against the provider's published keys, with asymmetric algorithms alone.  A person's rights follow from
 the groups that the provider names: the settings say which group gives which scopes.  Needs the extra `oidc` (PyJWT).
 """
 
@@ -42,7 +42,7 @@ FLEET = "fleet:"
 
 
 class Unreachable(RuntimeError):
-    """The provider does not answer as it should; the message is for the log and for whoever signs in."""
+    """The provider does not answer correctly; the message is for the log and for the person who signs in."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ def networks(text: str) -> tuple[Network, ...]:
 
 
 def safe_url(url: str) -> Receiver:
-    """The parts of a URL that events may be sent to, as far as that can be told without resolving its name.
+    """The parts of a URL that events may be sent to, as far as its text shows, without resolving its name.
 
     Raises UserError for anything but a plain http(s) URL without user and password.
     """
@@ -127,7 +127,7 @@ def post(url: str, body: bytes, headers: dict[str, str], allowed: Sequence[Netwo
 
 @contextmanager
 def _within(line: socket.socket, seconds: float) -> Iterator[None]:
-    """Hang up on whoever takes longer in all: the time-out of a socket begins anew with every byte."""
+    """Close connections that take longer in total: the time-out of a socket restarts with every byte."""
     with closing(line.dup()) as same:  # TLS takes the other one over
         ended = threading.Timer(seconds, _hang_up, [same])
         ended.daemon = True

@@ -1,7 +1,7 @@
 """Who may ask: bearer tokens with scopes, a fleet and an end; and sessions of people who signed in with one.
 
-A token is `sprung_ID_SECRET`.  The secret has 256 bits and is made here, so its SHA-256 tells nothing and needs no salt
-or stretching; the store holds only that.
+A token is `sprung_ID_SECRET`.  The secret has 256 random bits, so its SHA-256 reveals nothing and needs no salt or
+stretching; only that is stored.
 """
 
 from __future__ import annotations

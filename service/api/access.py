@@ -31,7 +31,7 @@ CoreOf = Annotated[Core, Depends(get_core)]
 
 
 async def get_actor(request: Request) -> Actor:
-    """Whom the guard found; `local` where nobody needs to sign in."""
+    """The actor that the guard identified; `local` without authentication."""
     found: Actor = request.scope.get("sprung.actor") or Actor()
     return found
 
@@ -40,7 +40,7 @@ ActorOf = Annotated[Actor, Depends(get_actor)]
 
 
 async def get_client(request: Request, actor: ActorOf) -> str:
-    """Who counts as one client: whose token it is, or the address where nobody needs to sign in."""
+    """Identity for per-client limits: the token's owner, or the address without authentication."""
     if actor == Actor():
         return f"address {client_of(request.client.host if request.client else '')}"
     return f"token {actor.name}"
@@ -76,7 +76,7 @@ def known_vehicle(found: bool, vehicle: str) -> None:
 
 
 def own_vehicle(actor: Actor, vehicle: str | None) -> None:
-    """403 for a vehicle of another fleet, and for work of which nobody knows whose vehicle it is about."""
+    """403 for a vehicle of another fleet, and for work whose vehicle is unknown."""
     if not actor.sees(vehicle):
         what = "name the vehicle" if vehicle is None else f"vehicle {vehicle[:128]!r} is of another fleet"
         raise ApiProblem(403, f"{what}; the token is for those that begin with {actor.fleet!r}")

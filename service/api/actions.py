@@ -57,10 +57,10 @@ class MaintenanceBody(NoteBody):
 
 
 class VehicleBody(StrictBody):
-    """What is to be changed; what is left out stays."""
+    """Fields to be changed; omitted ones are kept."""
 
     label: str | None = Field(
-        default=None, max_length=128, pattern=LINE_PATTERN, description="what people call it; empty takes it away"
+        default=None, max_length=128, pattern=LINE_PATTERN, description="display name; empty removes it"
     )
     retired: bool | None = Field(default=None, description="out of service: not listed, data kept")
 

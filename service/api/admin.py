@@ -1,4 +1,4 @@
-"""Tokens, the audit log, and a look at what the process does."""
+"""Tokens, the audit log, and a profile of the process."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class TokenBody(StrictBody):
 
 @router.get("/tokens", summary="Access tokens", response_model=list[dict[str, Any]])
 async def tokens(core: CoreOf) -> Response:
-    """Every token, the newest first; what they are worth is not kept anywhere."""
+    """All tokens, newest first; their secrets are not stored."""
     return json_response([token_dict(row) for row in await run_in_threadpool(core.tokens.rows)])
 
 

@@ -6,7 +6,7 @@ from pydantic import BaseModel, Field
 
 
 class CircumstanceAnswer(BaseModel):
-    """One quantity; null where nobody measured or knew it."""
+    """One quantity; null if it is unknown."""
 
     unit: str
     value: list[float | None]

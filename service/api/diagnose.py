@@ -1,4 +1,4 @@
-"""`POST /diagnose` and `GET /reports/{id}`: what a recording shows that the model leaves out."""
+"""`POST /diagnose` and `GET /reports/{id}`: unmodelled dynamics in a recording."""
 
 from __future__ import annotations
 
@@ -87,13 +87,13 @@ async def report_page(core: CoreOf, actor: ActorOf, id: str) -> Response:
     links = {"/": "Fleet"} | ({vehicle_page("", row.vehicle_id): row.vehicle_id} if row.vehicle_id else {})
     links |= {"/pages/work": "Reports", f"/reports/{row.id}": "JSON"}
     if path.with_name(IMPROVED).is_file():
-        links |= {f"/reports/{row.id}/system": "System file with what was found"}
+        links |= {f"/reports/{row.id}/system": "System file with the findings"}
         if row.vehicle_id is not None:  # the page itself may run nothing; the vehicle's asks once more
             links |= {f"{vehicle_page('', row.vehicle_id)}#use={row.id}": f"Use this model for {row.vehicle_id}"}
     return HTMLResponse(with_links(page, links))
 
 
-@router.get("/reports/{id}/system", summary="The system file with what was found", response_class=PlainTextResponse)
+@router.get("/reports/{id}/system", summary="The system file with the findings", response_class=PlainTextResponse)
 async def report_system(core: CoreOf, actor: ActorOf, id: str) -> Response:
     """Nominal values, laws and noise as the diagnosis found them, in a copy of the system file: for `serve --system`,
     `replay --system` and the other commands."""

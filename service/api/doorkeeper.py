@@ -17,7 +17,7 @@ from sprung.service.settings import Settings
 
 LOOK_SECONDS = 1.0
 RESERVED_DESCRIPTORS = 128  # for the store, uploads and workers
-MOST_LINGERING = 64  # refused connections that are still told so; they count in none of the limits
+MOST_LINGERING = 64  # refused connections that still get an answer; not counted in the limits
 BURST_SECONDS = 2.0  # of the permitted rate of broken-off requests that may come at once
 MOST_CLIENTS = 10_000  # whose broken-off requests are remembered
 MOST_UNSENT_BYTES = 200_000_000  # of answers that clients have not taken, of all together

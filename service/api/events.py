@@ -31,7 +31,7 @@ async def events(
 ) -> Response:
     """Server-sent events `vehicle` with `{"vehicle", "window", "alarms"}`, at most one a second and vehicle.
 
-    A client may follow 40 times at once (429). Of 200 in all, whoever has most gives its oldest up for others.
+    A client may follow 40 times at once (429). Of 200 in all, the client with most streams loses its oldest to others.
     """
     loop, ready = asyncio.get_running_loop(), asyncio.Event()
 

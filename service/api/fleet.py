@@ -34,7 +34,7 @@ async def vehicles(
     q: Annotated[str, Query(max_length=128, description="text in the id or the name")] = "",
     health: models.Health | None = None,
     silent: Annotated[bool, Query(description="only those from which nothing comes")] = False,
-    acknowledged: Annotated[bool | None, Query(description="false: with alarms that nobody has acknowledged")] = None,
+    acknowledged: Annotated[bool | None, Query(description="false: with unacknowledged alarms")] = None,
     retired: Annotated[bool, Query(description="those out of service instead")] = False,
 ) -> Response:
     """A page of vehicles; `next` is the `after` of the following page, null at the end."""

@@ -1,4 +1,4 @@
-"""`GET /fleet/knowledge`: what is usual in the fleet, who departs from it, who gets worse, who will cross a limit."""
+"""`GET /fleet/knowledge`: usual values in the fleet, outliers, trends, and predicted crossings of limits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sprung.service.fleet.telling import DAYS, knowledge_dict
 router = APIRouter(tags=["vehicles"])
 
 
-@router.get("/fleet/knowledge", summary="What the fleet tells", response_model=models.KnowledgeAnswer)
+@router.get("/fleet/knowledge", summary="Statistics of the fleet", response_model=models.KnowledgeAnswer)
 async def fleet_knowledge(
     core: CoreOf,
     actor: ActorOf,

@@ -75,8 +75,8 @@ class Guard:
         oidc: Provider | None = None,
         on_wait: Callable[[float], None] = lambda seconds: None,
     ) -> None:
-        """requests: takes the durations of requests; oidc: whose tokens are taken, too; on_wait: told how long requests
-        wait for one of the threads that they are worked on in."""
+        """requests: histogram of durations; oidc: provider whose tokens are accepted as well; on_wait: called with the
+        time, s, that requests wait for a thread."""
         self._on_wait = on_wait
         self.app = app
         self._oidc = oidc
@@ -152,13 +152,13 @@ class Guard:
         return not self._settings.open and (not self._local or self._oidc is not None or self._tokens.any)
 
     async def _who(self, scope: Scope, headers: Headers, need: Need) -> tuple[Actor, bool]:
-        """Who asks, and whether a browser said so by itself (with a cookie, or because nobody needs to); counted.
+        """The actor of a request, and whether a browser authenticates by itself (cookie, or no sign-in); counted.
 
         Requests of somebody count as his, all others as their address's, and before anything is looked up: whoever
         tries tokens runs dry.  A token that was good before does not wait for what others send from its address.
         """
         address = f"address {_address(scope)}"
-        if not need.scope:  # before the store is asked: it may be what is wrong
+        if not need.scope:  # before the store is queried, which may be at fault
             if need.limited:
                 self._limiter.take(address)
             return NOBODY, True

@@ -5,7 +5,7 @@ from __future__ import annotations
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-ASKED = "sprung.head"  # in the scope of a request whose answer's body nobody will see
+ASKED = "sprung.head"  # in the scope of a request whose answer has no body
 
 
 def headers_only(request: Request) -> bool:
@@ -14,7 +14,7 @@ def headers_only(request: Request) -> bool:
 
 
 class HeadAsGet:
-    """ASGI middleware.  Whoever asks is told to be gone, so that a stream which never ends does."""
+    """ASGI middleware.  The client is reported as disconnected, which ends infinite streams."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app

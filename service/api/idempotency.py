@@ -38,7 +38,7 @@ class Once:
     """Carries a request out unless an answer to its key is there."""
 
     def __init__(self, core: Core, key: str | None, request: Request, parts: list[bytes]) -> None:
-        """key: one of this caller alone; parts: what tells the request from others, without an upload."""
+        """key: unique per caller; parts: content that distinguishes the request, without an upload."""
         self._core = core
         self._key = key
         self._http = request
@@ -46,7 +46,7 @@ class Once:
         self._upload = b""
 
     def received(self, identity: str) -> None:
-        """Tell what was uploaded, before the answer is kept."""
+        """Set the identity of the upload, before the answer is kept."""
         self._upload = identity.encode()
 
     async def answer(self, act: Callable[[], Awaitable[Response]]) -> Response:

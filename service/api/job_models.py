@@ -1,4 +1,4 @@
-"""What clients are answered on jobs and what they leave: recordings, reports, notifications."""
+"""Answers on jobs and their results: recordings, reports, notifications."""
 
 from __future__ import annotations
 

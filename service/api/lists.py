@@ -1,4 +1,4 @@
-"""Lists over the whole fleet, newest first: alarms, jobs, reports, recordings, notifications; and what is monitored."""
+"""Lists over the fleet, newest first: alarms, jobs, reports, recordings, notifications; monitored parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The door of the fleet variant: estimates and windows in, handed to whoever identifies and folds.
+"""HTTP ingest of the fleet variant: receives estimates and windows and passes them to identification and folding.
 
 It is the same guard, the same bodies and the same answers as in the single process; behind it is anything that
 implements `Behind`, such as Ray Serve (`service.api.ray_serving`).
@@ -40,7 +40,7 @@ class Behind(Protocol):
         """Fold a message of estimates; it is stored when this returns."""
 
     async def identify_and_fold(self, sent: SentWindows) -> Taken:
-        """Identify windows and fold what they tell."""
+        """Identify windows and fold their estimates."""
 
 
 def ingest_app(settings: Settings, engine: Engine, store: Store, behind: Behind) -> FastAPI:

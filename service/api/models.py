@@ -83,8 +83,8 @@ class StandingAnswer(BaseModel):
     ratio: float
     std: float
     usual_ratio: float
-    departure: float = Field(description="from what is usual, in its standard deviations")
-    per_day: float | None = Field(description="change of the logarithm a day, less what the class did together")
+    departure: float = Field(description="from the usual value, in standard deviations of the class")
+    per_day: float | None = Field(description="change of the logarithm per day, relative to the class")
     per_day_std: float | None
     per_day_sure: float | None = Field(description="exceeded with 95 %; negative where not even the sign is sure")
     crossing_days: list[float | None] = Field(
@@ -104,7 +104,7 @@ class CommonAnswer(BaseModel):
 
 
 class TemperatureAnswer(BaseModel):
-    """How what the vehicles of a class do together follows the temperature."""
+    """Dependence of a class's common mode on the temperature."""
 
     vehicle_class: str
     kind: str
@@ -144,7 +144,7 @@ class ParameterAnswer(BaseModel):
     unit: str
     nominal: float
     ratio: float = Field(description="value / nominal")
-    identifiable: bool = Field(description="false: what is given is the prior, no measurement")
+    identifiable: bool = Field(description="false: the prior, not a measurement")
     baseline: float | None = Field(description="the vehicle's own healthy value; null while it is learned")
     drift: float | None = Field(description="value / baseline - 1")
     drift_std: float | None
@@ -168,12 +168,12 @@ class AlarmAnswer(BaseModel):
     report: str | None = Field(default=None, description="mismatch report that belongs to it")
     acknowledged: str | None = None
     acknowledged_by: str | None = None
-    alternatives: list[str] = Field(default=[], description="what the evidence does not tell it from")
+    alternatives: list[str] = Field(default=[], description="indistinguishable alternatives")
     bundle: str | None = Field(default=None, description="the signals around it, as one MCAP file")
 
 
 class WindowCounts(BaseModel):
-    """Windows by what became of them."""
+    """Windows by outcome."""
 
     used: int
     repaired: int
@@ -303,7 +303,7 @@ class AlarmPage(BaseModel):
 
 
 class ModelVersionAnswer(BaseModel):
-    """One system file of a vehicle, and what was estimated with it."""
+    """One system file of a vehicle, with its estimates."""
 
     version: int = Field(description="0: the service's system file")
     in_use: bool

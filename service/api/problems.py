@@ -59,7 +59,7 @@ def problem_response(problem: ApiProblem, instance: str) -> Response:
     }
     if problem.errors:
         body["errors"] = problem.errors
-    headers = {"X-Content-Type-Options": "nosniff"} | problem.headers  # details may repeat what the client sent
+    headers = {"X-Content-Type-Options": "nosniff"} | problem.headers  # details may contain client input
     return Response(json.dumps(body), problem.status, headers, MEDIA_TYPE)
 
 
@@ -70,7 +70,7 @@ def wants_page(method: str, headers: Mapping[str, str]) -> bool:
 
 
 def problem_page(problem: ApiProblem) -> Response:
-    """The same answer for people: what is wrong, and a way back."""
+    """The same answer as a page: the error, and a link back."""
     title = HTTPStatus(problem.status).phrase
     return HTMLResponse(
         render("problem.html", title=title, status=problem.status, detail=problem.detail),
@@ -110,7 +110,7 @@ def install(app: FastAPI) -> None:
     """Answer every exception of the app with a problem."""
 
     async def on_problem(request: Request, error: Exception) -> Response:
-        if isinstance(error, ClientDisconnect):  # nobody is there to be answered
+        if isinstance(error, ClientDisconnect):  # the client is gone
             return Response(status_code=499)
         problem = _as_problem(error)
         if problem.status == 405:
@@ -124,7 +124,7 @@ def install(app: FastAPI) -> None:
 
 
 def _methods(app: FastAPI, request: Request) -> list[str]:
-    """The methods of all routes at a path: each route by itself tells only its own."""
+    """The methods of all routes at a path: a single route only knows its own."""
     found: set[str] = set()
 
     def walk(routes: Sequence[BaseRoute]) -> None:
@@ -168,7 +168,7 @@ def _as_problem(error: Exception) -> ApiProblem:
 
 
 def _fault(error: Mapping[str, Any]) -> dict[str, str]:
-    """A field and what is wrong with it; `body` where it is no field's fault."""
+    """A field and its error; `body` for errors of no field."""
     if error["type"] == "json_invalid":
         place = f"is no JSON: {error.get('ctx', {}).get('error', error['msg'])}, character {error['loc'][-1]}"
         return {"field": "body", "detail": place}

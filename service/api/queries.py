@@ -35,8 +35,8 @@ async def only_known_parameters(request: Request) -> None:
     known = {field.alias for field in route.dependant.query_params}
     wrong = [name for name in request.query_params if name not in known]
     if wrong:
-        told = f"the route has {', '.join(sorted(known))}" if known else "the route has none"
-        errors = [{"field": name[:100], "detail": f"is no query parameter here; {told}"} for name in wrong[:20]]
+        allowed = f"the route has {', '.join(sorted(known))}" if known else "the route has none"
+        errors = [{"field": name[:100], "detail": f"is not a query parameter here; {allowed}"} for name in wrong[:20]]
         raise ApiProblem(422, f"{errors[0]['field']} {errors[0]['detail']}", errors)
     for field in route.dependant.query_params:
         takes_several = any(get_origin(part) is list for part in get_args(field.field_info.annotation))

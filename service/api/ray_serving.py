@@ -1,7 +1,7 @@
 """Live windows on Ray Serve: a door, identification batched over vehicles, folding in one transaction a batch.
 
 Three deployments, each with as many replicas as its queue asks for.  None holds anything that the store does not: a
-replica that dies takes only requests with it that nobody was told were stored, and their senders send them again.
+replica that dies loses only unacknowledged requests, which their senders repeat.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
         return ingest_app(settings, engine, open_store(settings.store_url), behind)
 
     class Door:
-        """Asks who it is, reads what was sent, hands it on."""
+        """Authenticates requests, reads their bodies, passes them on."""
 
         def __init__(self, *after: Any) -> None:
             """after: deployments that are started before it."""
@@ -209,7 +209,7 @@ def start(
 
 
 def stop() -> None:
-    """Let what is asked be answered, then leave the cluster, or end the one that was started here.
+    """Answer pending requests, then leave the cluster, or end the one that was started here.
 
     Only the application goes: a cluster may serve others, and Serve itself ends with its Ray.
     """
@@ -221,7 +221,7 @@ def stop() -> None:
 
 
 def abandon() -> None:
-    """End what was started here though nobody answers any more; does not wait for Ray for long."""
+    """End what was started here without answers; waits for Ray only briefly."""
     import ray
 
     leaving = threading.Thread(target=ray.shutdown, daemon=True)

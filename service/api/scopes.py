@@ -1,4 +1,4 @@
-"""What a request needs: by method and path, so that a route which nobody thought of needs the most."""
+"""Scopes of requests, by method and path; unlisted routes need the highest."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class GuardedProtocol(H11Protocol):
         self.host = client_of(self.client[0] if self.client else "")
         self.active = self._begun = time.monotonic()  # when something came; when the request that is awaited began
         self._received = 0
-        self._full: float | None = None  # since when the client has not taken what was written for it
+        self._full: float | None = None  # since when the client has not read its answer
         self._unsent, self._moved = 0, self.active  # bytes that waited when it was last looked at, and since when
         _hold_little(transport)
         self._admitted = self.doorkeeper.admit(self)
@@ -98,7 +98,7 @@ class GuardedProtocol(H11Protocol):
             self.transport.write_eof()
 
     def send_400_response(self, msg: str) -> None:
-        """Answer what is no HTTP as every error is answered, and close."""
+        """Answer malformed HTTP as problem+json, and close."""
         headers = [
             (b"content-type", b"application/problem+json"),
             (b"content-length", b"%d" % len(NO_HTTP_BODY)),
@@ -130,7 +130,7 @@ class GuardedProtocol(H11Protocol):
 
     @property
     def unsent(self) -> int:
-        """Bytes of answers that the client has not taken, beside what the kernel holds."""
+        """Bytes of answers that the client has not read, without those in the kernel's buffer."""
         return self.transport.get_write_buffer_size()
 
     @property
@@ -177,14 +177,14 @@ class GuardedProtocol(H11Protocol):
     def end(self) -> None:
         """Close now, also where it is closing and would wait for the client to take the rest."""
         connection = self.transport.get_extra_info("socket")
-        if connection is not None and self.unsent:  # else the kernel would keep what the client does not take
+        if connection is not None and self.unsent:  # else the kernel would keep unread data
             with suppress(OSError):
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.transport.abort()
 
 
 class Server(uvicorn.Server):
-    """uvicorn, with a doorkeeper, that tells of a signal at once."""
+    """uvicorn with a doorkeeper and immediate notice of signals."""
 
     def __init__(self, config: uvicorn.Config, doorkeeper: Doorkeeper, on_exit: Callable[[], None]) -> None:
         super().__init__(config)
@@ -217,7 +217,7 @@ def make_server(app: FastAPI, settings: Settings, on_exit: Callable[[], None]) -
         log_config=None,
         access_log=False,
         server_header=False,
-        # uvicorn would believe whoever connects from this machine, also where there is no proxy
+        # uvicorn would trust all local clients, even without a proxy
         proxy_headers=bool(settings.trusted_proxies),
         forwarded_allow_ips=list(settings.trusted_proxies),
         timeout_graceful_shutdown=settings.shutdown_seconds,
@@ -231,7 +231,7 @@ def make_server(app: FastAPI, settings: Settings, on_exit: Callable[[], None]) -
 
 
 def _hold_little(transport: asyncio.BaseTransport) -> None:
-    """Let the kernel hold little of an answer beyond what is on its way, where it can be told so."""
+    """Limit the kernel's send buffer, where supported."""
     connection, option = transport.get_extra_info("socket"), getattr(socket, "TCP_NOTSENT_LOWAT", None)
     if connection is not None and option is not None:
         with suppress(OSError):  # no TCP, or gone already

@@ -42,7 +42,7 @@ async def sign_in(request: Request, core: CoreOf) -> Response:
     try:
         session, actor = await run_in_threadpool(core.tokens.sign_in, str(form.get("token", "")).strip())
     except Refused as refused:
-        await asyncio.sleep(0.5)  # whoever guesses has time
+        await asyncio.sleep(0.5)  # slows down guessing
         return _form(core, to, str(refused), 401)
     await note(core, actor, "sign in", actor.name)
     response = RedirectResponse(to, 303)
@@ -69,7 +69,7 @@ async def sign_in_elsewhere(
 
 @returns.get(CALLBACK)
 async def signed_in_elsewhere(request: Request, core: CoreOf) -> Response:
-    """Take what the provider sent along, give a session."""
+    """Verify the provider's answer, begin a session."""
     sent = request.query_params
     state, code = sent.get("state", "")[:LONGEST], sent.get("code", "")[:LONGEST]
     provider = _provider(core)

@@ -1,4 +1,4 @@
-"""Keys that a JSON object has twice: parsers keep the last one in silence, and the first may be what was meant."""
+"""Keys that a JSON object has twice: parsers silently keep the last one, while the first may be the intended one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AT_ONCE = 20_000  # bytes; longer bodies are looked at in a thread
 def keys_twice(content: bytes) -> list[str]:
     """Names that an object of the document has more than once, in the order in which their objects end.
 
-    Empty for what is no JSON: whoever reads it says so.
+    Empty for invalid JSON, which its reader reports.
     """
     found: dict[str, None] = {}
 

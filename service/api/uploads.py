@@ -1,4 +1,4 @@
-"""Uploads: multipart/form-data straight to the data folder, refused as soon as what came of it says so."""
+"""Uploads: multipart/form-data streamed to the data folder, refused as early as possible."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ class Upload:
 
     row: RecordingRow
     vehicle: str | None
-    identity: str  # tells a form from others: the file's content and name, and the vehicle
+    identity: str  # of a form: the file's content and name, and the vehicle
     fresh: bool = True  # False: it was sent before and is still kept; the row is that one's
 
 
 @asynccontextmanager
 async def receive(request: Request, core: Core) -> AsyncIterator[Upload]:
-    """Take the form of a request; the file stays unless what is done with it fails.
+    """Receive the form of a request; the file is kept unless its handling fails.
 
     Raises ApiProblem: 415 for another type of body or of file, 413 when it is too large, 422 for a wrong form; NoSpace.
     Nothing stays on the disk then.
@@ -194,7 +194,7 @@ class Form:
         return Upload(row, vehicle, json.dumps([digest, self._label, vehicle]))
 
     def close(self) -> None:
-        """Delete what was not finished."""
+        """Delete an unfinished upload."""
         if self._target is not None and not self._target.closed:
             self._target.close()
         if self._part_file:

@@ -46,12 +46,12 @@ def windows(request: ReadRequest) -> Iterator[ReadWindows]:
 
 def reading(request: ReadRequest) -> Reading:
     """A recording that is about to be read.  Raises OSError where there is none."""
-    with open(request.path, "rb"):  # an absent file is told without a process
+    with open(request.path, "rb"):  # an absent file is reported without starting a process
         pass
     return reading_of(request, own_limits(settings_with({}), request.path))
 
 
 def _apart(task: Task[Request, None, Result], request: Request, path: Path) -> Result:
-    with open(path, "rb"):  # an absent file is told without a process
+    with open(path, "rb"):  # an absent file is reported without starting a process
         pass
     return carried_out(task, request, own_limits(settings_with({}), path), f"the reading of {path.name}")

@@ -252,7 +252,7 @@ def experiment(
     ] = None,
     json_lines: Json = False,
 ) -> int:
-    """Which run would tell look-alikes apart best, and the evidence to expect of it."""
+    """Which run would distinguish look-alikes best, with the expected evidence."""
     from sprung.service.cli.experiment import run
 
     return run(models, system, menu, known, json_lines)
@@ -321,7 +321,7 @@ def import_model(
     ] = None,
     name: Annotated[str | None, typer.Option("--name", help="Name of the system; default: the file's.")] = None,
 ) -> int:
-    """A system file from a linear model's matrices: a baseline to identify and to look for what it leaves out."""
+    """A system file from a linear model's matrices: a baseline for identification and diagnosis."""
     from sprung.service.cli.system import import_matrices
 
     return import_matrices(file, out, rate, name)

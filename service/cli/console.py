@@ -36,7 +36,7 @@ def print_table(table: Table) -> None:
 
 @contextmanager
 def stages(console: Console) -> Iterator[Callable[[float, str], None]]:
-    """A callback for the share that is done and what is done now: a bar on a terminal, else a line per stage."""
+    """A progress callback (share, stage): a bar on a terminal, else a line per stage."""
     if not console.is_terminal:
         shown = ""
 

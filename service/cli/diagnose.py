@@ -67,11 +67,13 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
         write_improved(asked.write_system, source, system, report)
         missing = left_out(report)
         more = f"; not in it: {', '.join(missing)}" if missing else ""
-        print(f"sprung: {asked.write_system}: the system with what was found{more}", file=sys.stderr)
+        print(f"sprung: {asked.write_system}: the system with the findings{more}", file=sys.stderr)
     if asked.write_laws is not None:
         count = write_laws(asked.write_laws, report)
-        told = f"{count} of them, for --laws; give them names" if count else "no formula was found; nothing is written"
-        print(f"sprung: {asked.write_laws}: {told}", file=sys.stderr)
+        result = (
+            f"{count} of them, for --laws; give them names" if count else "no formula was found; nothing is written"
+        )
+        print(f"sprung: {asked.write_laws}: {result}", file=sys.stderr)
     if json_lines:
         print(json.dumps(report.to_dict(), allow_nan=False), flush=True)
     else:
@@ -80,7 +82,7 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
 
 
 def _check_targets(asked: Asked) -> None:
-    """Files that cannot be written are told before the work, not after it."""
+    """Files that cannot be written are reported before the work begins."""
     check_file(asked.write_system)
     check_file(asked.write_laws)
     check_folder(asked.out)

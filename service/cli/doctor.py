@@ -138,7 +138,7 @@ def _clock(_settings: Settings) -> Iterator[Check]:
     elif said == "no":
         yield Check("warning", "clock", f"{now}, not synchronised: windows of live buses carry this machine's time")
     else:
-        yield Check("ok", "clock", f"{now}; whether it is synchronised cannot be told here")
+        yield Check("ok", "clock", f"{now}; its synchronisation cannot be checked here")
 
 
 def _bus(name: str) -> Check:

@@ -31,12 +31,12 @@ from sprung.service.sources.live import LiveFeed
 from sprung.service.sources.reading import ReadRequest
 
 log = logging.getLogger("sprung.edge")
-LAST_SECONDS = 20.0  # to send what is left when it stops
+LAST_SECONDS = 20.0  # to send remaining messages at the end
 
 
 @dataclass(frozen=True, slots=True)
 class Destination:
-    """Where what is made on board goes."""
+    """Destination of messages from the vehicle."""
 
     server: str  # http(s)://, or nats:// for estimates only
     recordings: str | None  # raw samples; None: to the server, too
@@ -67,7 +67,7 @@ def run(
     rates: OnboardSettings,
     json_lines: bool,
 ) -> int:
-    """Identify on board and send, until the files end or somebody stops it."""
+    """Identify on board and send, until the files end or it is stopped."""
     if bool(files) == (bus is not None):
         raise UserError("give recordings or --can, one of both")
     for path in files:

@@ -1,4 +1,4 @@
-"""`sprung experiment`: which run of a menu would tell models apart that one recording could not."""
+"""`sprung experiment`: which run of a menu would distinguish models that one recording could not."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MOST_RIVALS = 3  # of one finding, the nearest
 def run(
     models: list[Path], system_file: Path | None, menu_file: Path | None, known: float | None, json_lines: bool
 ) -> int:
-    """Print the menu's runs, the one that tells most for its cost first."""
+    """Print the menu's runs, best evidence per cost first."""
     menu = read_menu(menu_file or BUNDLED)
     report = _report_of(models)
     if report is None:
@@ -44,7 +44,7 @@ def _report_of(models: list[Path]) -> Path | None:
         return None
     path = models[0] / "report.json" if models[0].is_dir() else models[0]
     if path.suffix != ".json":
-        raise UserError(f"{path}: one model has nothing to be told from; give two system files or more, or a report")
+        raise UserError(f"{path}: a single model has no alternative; give two system files or more, or a report")
     return path
 
 
@@ -68,7 +68,7 @@ def _from_report(path: Path, system_file: Path, menu: Menu) -> dict[str, System]
         raise UserError(f"{path}: is no report of `sprung diagnose`") from error
     if not system_file.is_file():
         raise UserError(
-            f"{system_file}: name the system file with what was found by --system (diagnose --write-system writes it)"
+            f"{system_file}: name the system file with the findings by --system (diagnose --write-system writes it)"
         )
     system = load_system(system_file)
     check_menu(menu, system)
@@ -84,7 +84,9 @@ def _from_report(path: Path, system_file: Path, menu: Menu) -> dict[str, System]
             except NoRival as told:
                 print(told, file=sys.stderr)
     if len(systems) < 2:
-        raise UserError(f"{path}: names no look-alike of a law that {system_file} holds; nothing remains to be told")
+        raise UserError(
+            f"{path}: names no look-alike of a law that {system_file} holds; there is nothing to distinguish"
+        )
     return systems
 
 
@@ -112,12 +114,12 @@ def _as_dict(found: RankedRun) -> dict[str, Any]:
 
 
 def _show(found: list[RankedRun], names: list[str]) -> None:
-    print(f"told apart: {', '.join(names)}")
+    print(f"distinguished: {', '.join(names)}")
     print(f"{'run':<28}{'evidence':>11}{'per cost':>11}  chance that it is strong")
     for one in found:
         print(f"{one.run[:27]:<28}{one.evidence:>11.5g}{one.per_cost:>11.5g}  {100 * one.chance:.0f} %")
     best = found[0]
     if best.chance < 0.5:
-        print("no run of the menu is likely to decide: longer or rougher runs would tell more")
+        print("no run of the menu is likely to decide: longer or rougher runs would be more informative")
     else:
         print(f"do next: {best.run}")

@@ -56,7 +56,7 @@ def run_backfill(
     )
     if plan.since >= plan.until:
         raise UserError(f"--until {until}: is not after --since {since}")
-    list_recordings(plan.place)  # told before anything is started
+    list_recordings(plan.place)  # raises before anything is started
     started = time.perf_counter()
 
     def show(file: FoldedFile, done: int, of: int) -> None:
@@ -91,7 +91,7 @@ def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, worker
     """Diagnose many; 1 when one is not consistent, or cannot be diagnosed."""
     settings, started = settings_with(options), time.perf_counter()
     check_folder(out)
-    list_recordings(_place(place))  # told before anything is started
+    list_recordings(_place(place))  # raises before anything is started
     tasks = tasks_for(_on(on), workers)
     verdicts: Counter[str] = Counter()
     before, problems = 0, []
@@ -121,7 +121,7 @@ def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, worker
 
 
 def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None, workers: int | None) -> int:
-    """Serve until told to stop."""
+    """Serve until stopped."""
     settings = settings_with(options)
     with closing(open_store(settings.store_url)) as store:  # migrated once, before replicas start
         notice = access_notice(settings, Tokens(store).any)
@@ -141,10 +141,10 @@ def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None,
 
 
 def run_consume(options: dict[str, Any], address: str, alive: Path | None) -> int:
-    """Take messages until told to stop."""
+    """Consume messages until stopped."""
     settings = settings_with(options)
     if alive is not None:
-        alive.touch()  # told now where it cannot be
+        alive.touch()  # raises now if it cannot be written
     set_up(settings.log_format, settings.log_level)
     engine = load_engine(settings)
     counts = ConsumerCounts()

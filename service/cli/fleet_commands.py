@@ -45,7 +45,7 @@ def edge(
         float, typer.Option("--message-seconds", min=1, help="Of windows in one message.")
     ] = 60.0,
     weigh_seconds: Annotated[
-        float, typer.Option("--weigh-seconds", min=1, help="Between windows that tell of gains, delays and loads.")
+        float, typer.Option("--weigh-seconds", min=1, help="Between windows with evidence on gains, delays and loads.")
     ] = 30.0,
     raw_seconds: Annotated[
         float, typer.Option("--raw-seconds", min=0, help="Of raw samples around an alarm; 0: none.")
@@ -91,9 +91,9 @@ def backfill(
     weights: Weights = None,
     json_lines: Json = False,
 ) -> int:
-    """Make the history of many recordings anew, in parallel, and put it in the place of what was there.
+    """Compute the history of many recordings anew, in parallel, and replace the existing one.
 
-    Started again it goes on where it stopped.  Files that cannot be read are told at the end.
+    Restarted, it continues where it stopped.  Unreadable files are reported at the end.
     """
     one_thread_each()
     from sprung.service.cli.fleet import run_backfill
@@ -152,7 +152,7 @@ def consume(
     system: System = None,
     weights: Weights = None,
 ) -> int:
-    """Fold what a broker holds, acknowledged once it is stored; several may do so on one PostgreSQL store."""
+    """Fold the messages of a broker, acknowledged once they are stored; several may do so on one PostgreSQL store."""
     one_thread_each()
     from sprung.service.cli.fleet import run_consume
 

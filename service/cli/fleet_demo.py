@@ -22,7 +22,7 @@ SPEED = "10"  # times real time
 
 
 def run(vehicles: int, port: int) -> int:
-    """Start a database, the pages, the ingest and some vehicles; end them all when told to stop."""
+    """Start a database, the pages, the ingest and some vehicles; end them all when stopped."""
     if not RECORDING.exists():
         raise UserError(f"{RECORDING}: is not here; the demo needs a clone of the repository")
     with ExitStack() as stack:
@@ -63,7 +63,7 @@ def run(vehicles: int, port: int) -> int:
 
 
 def wait_ready(services: set[str], started: Sequence[subprocess.Popen[bytes]]) -> None:
-    """Return when every service says that it is ready: what a vehicle makes before would only wait on board.
+    """Return when every service is ready: earlier messages of vehicles would only wait on board.
 
     Raises UserError when one of the processes that were started ends before.
     """
@@ -78,7 +78,7 @@ def _ready(service: str) -> bool:
     try:
         with urlopen(f"{service}/health/ready", timeout=5):
             return True
-    except OSError:  # nobody there yet, or not ready
+    except OSError:  # not listening yet, or not ready
         return False
 
 

@@ -34,7 +34,7 @@ def run(
     write_system: Path | None,
     json_lines: bool,
 ) -> int:
-    """Print what is in a recording; 1 when some of it could not be read."""
+    """Print the contents of a recording; 1 if part of it could not be read."""
     check_file(write_system)
     time, said = _time(system_file, column, unit, rate)
     found = apart.look(InspectionRequest(file, dbc, time))

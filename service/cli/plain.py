@@ -1,4 +1,4 @@
-"""Help in plain words: what a value is called, not the type that it has in Python."""
+"""Help in plain words: names of values instead of Python types."""
 
 from __future__ import annotations
 

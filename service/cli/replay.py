@@ -145,7 +145,7 @@ def _replay(
 
 @contextmanager
 def told_when_interrupted(kept: Counter[str], url: object | None) -> Iterator[None]:
-    """After Ctrl-C: what is stored, and how to go on.  url: of the store; None where it goes with this run."""
+    """After Ctrl-C: what is stored, and how to continue.  url: of the store; None if it is temporary."""
     try:
         yield
     except KeyboardInterrupt:
@@ -195,7 +195,7 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
 
 
 def health(view: VehicleView, fed: Fed) -> str:
-    """The vehicle's health; a recording that hardly tells of it calls for a check of the function."""
+    """The vehicle's health; an uninformative recording asks for a functional check."""
     return view.health if fed.monitored or view.health == "failure" else "check_function"
 
 
@@ -209,7 +209,7 @@ def slower_line(fed: Fed, speed: float) -> str | None:
 
 
 def closing_line(view: VehicleView, fed: Fed) -> str:
-    """What was read, how fast, and what is alarmed."""
+    """Closing line: data read, speed, and alarms."""
     recorded = fed.recorded_seconds
     counts = ", ".join(f"{count} {outcome}" for outcome, count in fed.windows.items())
     pace = recorded / max(fed.wall_seconds, 1e-9)
@@ -221,7 +221,7 @@ def closing_line(view: VehicleView, fed: Fed) -> str:
     for alarm in view.active:
         what = told(alarm) or "windows no longer fit the model"
         change = f" {size_in_words(alarm.parameter, alarm.change, alarm.std)}".rstrip()
-        apart = "; the measurements do not tell which" if alarm.alternatives else ""
+        apart = "; the measurements do not distinguish them" if alarm.alternatives else ""
         lines.append(f"{alarm.severity}: {what}{change} since {to_iso(alarm.onset)}{apart}")
     return "\n".join([*lines, *measurement_lines(view.measurements())])
 
@@ -238,7 +238,7 @@ def measurement_lines(found: dict[str, Any]) -> list[str]:
         for one in found.get("built", [])
     ]
     loads = found.get("load") or {}
-    before = f", as of {found['load_as_of']}; nothing since tells of it" if found.get("load_as_of") else ""
+    before = f", as of {found['load_as_of']}; not observable since" if found.get("load_as_of") else ""
     return lines + [
         f"load: {body} {mass:+.0f} ± {std:.0f} kg against nominal{before}" for body, (mass, std) in loads.items()
     ]

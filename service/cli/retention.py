@@ -9,7 +9,7 @@ from sprung.service.times import to_iso
 
 
 def run(dry_run: bool, store: str | None) -> int:
-    """Forget, or tell what would be forgotten."""
+    """Delete old data, or list what would be deleted."""
     settings = settings_with({"store": store})
     opened = open_store(settings.store_url)
     try:

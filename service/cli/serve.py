@@ -22,7 +22,7 @@ from sprung.service.sources.feed import Fed, OnBatch
 
 
 def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[str], vehicle: str | None) -> int:
-    """Serve until told to stop."""
+    """Serve until stopped."""
     for path in files:
         readable(path)
     settings = settings_with(options)

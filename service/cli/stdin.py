@@ -12,7 +12,7 @@ from pathlib import Path
 from sprung.service.errors import UserError
 
 CALLED = Path("standard input")  # in messages
-MAGIC = (  # how each kind of file begins; text is told by its first line
+MAGIC = (  # how each kind of file begins; text is recognised by its first line
     (b"\x89MCAP", ".mcap"),
     (b"LOGG", ".blf"),
     (b"MDF ", ".mf4"),

@@ -1,4 +1,4 @@
-"""`sprung retention`, `backup`, `restore` and `token ...`: what a service keeps, and who may ask it."""
+"""`sprung retention`, `backup`, `restore` and `token ...`: stored data, and access to the service."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ DataDir = Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", he
 
 
 def retention(
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would be forgotten.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be deleted.")] = False,
     store: StoreUrl = None,
 ) -> int:
-    """Forget now what the settings SPRUNG_RETENTION_... do not keep; the service does so every hour."""
+    """Delete now what is older than the settings SPRUNG_RETENTION_... keep; the service does so every hour."""
     from sprung.service.cli.retention import run
 
     return run(dry_run, store)
@@ -62,7 +62,7 @@ def token_create(
 
 @token.command("list")
 def token_list(json_lines: Json = False, store: StoreUrl = None) -> int:
-    """List the tokens, without what they are worth."""
+    """List the tokens, without their secrets."""
     from sprung.service.cli.token import show
 
     return show(json_lines, store)

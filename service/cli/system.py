@@ -21,7 +21,7 @@ from sprung.service.cli.export import export, left_out
 from sprung.service.cli.targets import check_file
 from sprung.service.rendering.render import quantity
 
-KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
+KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window is hardly informative
 
 
 def import_matrices(file: Path, out: Path, rate: float | None, name: str | None) -> int:
@@ -39,7 +39,7 @@ def import_matrices(file: Path, out: Path, rate: float | None, name: str | None)
 
 
 def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = None) -> int:
-    """Check the file and print what it says, or print the JSON Schema of the format.
+    """Check the file and print its contents, or print the JSON Schema of the format.
 
     Errors: `SystemFileError` with all problems of a file.
     """
@@ -115,8 +115,8 @@ def _parameters(system: System, told: Any) -> Table:
     if not system.file.inputs:
         under = "without any measured input, of vibration well above the noise,"
     elif system.on_track:
-        under = "on an average track that nobody measures"
-    title = f"What one window of {system.window / system.sample_rate:g} s {under} tells"
+        under = "on an average unmeasured track"
+    title = f"What one window of {system.window / system.sample_rate:g} s {under} determines"
     table = Table("parameter", "nominal", "standard deviation", "", title=title, title_justify="left")
     for parameter, std in zip(system.parameters, np.asarray(told), strict=True):
         known = std < KNOWN_SHARE * PRIOR_STD

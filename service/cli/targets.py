@@ -1,4 +1,4 @@
-"""Whether what a long command is asked to write can be written: told before the work, not after it."""
+"""Output files of long commands are checked before the work begins."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def check_folder(path: Path | None) -> None:
 
 
 def _try(folder: Path, wanted: Path) -> None:
-    """Write something there, as permissions do not tell of full disks and read-only ones."""
+    """Try to write there, since permissions do not reveal full or read-only disks."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"x")

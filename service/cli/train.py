@@ -33,7 +33,7 @@ TOGETHER = 128  # windows that the reader hands over at once
 
 
 def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out: Path, changes: dict[str, Any]) -> int:
-    """Train, and print what was reached."""
+    """Train, and print the results."""
     from sprung.model.identification.training import TrainingSettings, train, training_benefit
 
     check_folder(out)

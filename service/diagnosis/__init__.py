@@ -1,1 +1,1 @@
-"""Diagnoses, each in a process of its own, asked for or started by misfit; and what is made of their findings."""
+"""Diagnoses, each in a process of its own, requested or started by misfit; and the use of their findings."""

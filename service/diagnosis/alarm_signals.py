@@ -46,7 +46,7 @@ class AlarmSignals:
         self._rings = rings
 
     def on_batch(self, batch: Batch) -> None:
-        """Keep what is held of a vehicle when the batch raised an alarm; call it once the rings have the batch.
+        """Keep the held samples of a vehicle if the batch raised an alarm; call it after the rings have the batch.
 
         What cannot be kept is logged: the alarm itself is worth more than its signals.
         """

@@ -1,4 +1,4 @@
-"""The system file with what a diagnosis found: nominal values, laws and noise; comments and order stay."""
+"""The system file with the findings of a diagnosis: nominal values, laws and noise; comments and order are kept."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _parameters(system: System, report: Report) -> tuple[ReportedParameter, ...]
 def left_out(report: Report) -> list[str]:
     """Findings that the improved file cannot hold, `unknown at secondary_2r`: nothing may go in silence.
 
-    Forces without a name, and what is wrong with the set-up of the measurement.
+    Unnamed forces, and faults of the measurement set-up.
     """
     held = {(law.location, law.effect) for law in report.laws} | {
         (finding.location, finding.effect) for finding in report.findings if finding.effect == SENSOR_NOISE.name
@@ -113,7 +113,7 @@ def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> Non
         setting = CommentedMap(value=_rounded(parameter.value))
         if parameter.std > 0:
             setting["std"] = float(f"{parameter.std:.3g}")
-        # a minute of running tells the width of friction's corner, a window does not
+        # identifiable from a minute of running, but not from a window
         if index == corner or f"{law.location}.{law.effect}.{parameter.name}" in held:
             setting["fixed"] = True
         setting.fa.set_flow_style()

@@ -30,7 +30,7 @@ from sprung.service.store.work import JobRow, RecordingRow, ReportRow
 from sprung.service.times import NANOSECONDS, now_ns
 
 log = logging.getLogger("sprung.diagnosis")
-SEARCH = 0.6  # of the time of a diagnosis; the rest is for what is being fitted then, the last fit and the pictures
+SEARCH = 0.6  # share of a diagnosis's time; the rest is for the running fits, the last fit and the plots
 
 
 class Diagnoses:
@@ -109,7 +109,7 @@ class DiagnosisJobs:
         task: Task[DiagnosisRequest, Stage, DiagnosisResult] = run,
         on_report: OnReport = lambda connection, vehicle, report_id, report: None,
     ) -> None:
-        """on_report: told of a new report inside the transaction that stores it."""
+        """on_report: called with a new report inside the transaction that stores it."""
         self._settings = settings
         self._engines = pipeline.engines
         self._store = pipeline.store
@@ -166,5 +166,5 @@ class DiagnosisJobs:
         try:
             return source.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            log.warning("%s: what is found cannot be written into a copy of it: %s", source, error)
+            log.warning("%s: findings cannot be written into a copy of it: %s", source, error)
             return None

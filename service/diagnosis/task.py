@@ -1,4 +1,4 @@
-"""What goes into the process of a diagnosis and what comes out; light, since both sides load it."""
+"""Input and output of a diagnosis process; light, since both sides load it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from sprung.model.system import System
 
-IMPROVED = "system.yaml"  # in the report's folder: the system file with what was found
+IMPROVED = "system.yaml"  # in the report's folder: the system file with the findings
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +21,8 @@ class DiagnosisRequest:
     system: System
     dbc: Path | None
     out: Path  # folder for page, pictures and report; made when absent
-    system_text: str | None = None  # the file that the system was read from: what was found is written into a copy
-    search_seconds: float = math.inf  # after which no further candidate is fitted, and what was found is reported
+    system_text: str | None = None  # source of the system: findings are written into a copy
+    search_seconds: float = math.inf  # time limit of the search
 
 
 @dataclass(frozen=True, slots=True)

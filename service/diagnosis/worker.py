@@ -66,7 +66,7 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
             try:
                 write_improved(request.out / IMPROVED, request.system_text, request.system, report)
             except (OSError, ValueError) as error:  # changed since the service began: the report stays good
-                log.warning("the system file is not written with what was found: %s", error)
+                log.warning("the system file with the findings is not written: %s", error)
         return DiagnosisResult(report.verdict, report.to_dict())
     except ValueError as error:
         raise ValueError(str(error).replace(str(request.path), request.name)) from error

@@ -59,7 +59,7 @@ def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequ
 
 
 def _told(file: McapSink, found: Bundle, excerpt: Excerpt | None, windows: Sequence[Compared]) -> None:
-    """An event that says what the file holds and what it lacks."""
+    """An event that describes the contents of the file and what is missing."""
     text, level = found.told, INFO
     if excerpt is None:
         level = WARNING

@@ -39,7 +39,7 @@ from sprung.service.store.work import RecordingRow
 from sprung.service.times import now_ns
 
 KINDS = (".mcap", ".blf", ".asc", ".log", ".mf4", ".csv", ".parquet", ".mat", ".h5", ".hdf5", ".tdms")
-AHEAD = 4  # files a core that may be identified before their turn: bounds what waits in memory or on disk
+AHEAD = 4  # files per core that may be identified ahead: bounds waiting results
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +285,7 @@ def fold_file(plan: BackfillPlan, found: IdentifiedFile, before: FoldedFile | No
 
 
 def swap_vehicle(plan: BackfillPlan, vehicle: str) -> bool:
-    """Put what was made of a vehicle in the place of what was there; whether there was anything."""
+    """Replace a vehicle's history by the new one; whether there was one."""
     with staging_pipeline(plan) as made, shown_pipeline(plan, made.store) as shown:
         with made.store.write() as connection:
             fleet.hold_vehicle(connection, vehicle)
@@ -319,7 +319,7 @@ def opened_store(settings: Settings, migrated: bool = False) -> Iterator[Store]:
 
 @contextmanager
 def staging_pipeline(plan: BackfillPlan) -> Iterator[Pipeline]:
-    """A pipeline whose model nobody sees yet."""
+    """A pipeline into a model that is not visible yet."""
     engine = engine_of(plan.settings)
     with opened_store(plan.settings, migrated=True) as store, ExitStack() as stack:
         compute = Compute(1)

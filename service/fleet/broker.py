@@ -1,7 +1,7 @@
 """Messages of estimates from a broker: taken in batches, acknowledged once they are stored.
 
 A broker holds what a vehicle could deliver while the service was away.  The interface is small enough for NATS
-JetStream and Kafka alike; what a message does to the store does not depend on how often it comes
+JetStream and Kafka alike; the effect of a message does not depend on the number of its deliveries
 (`service.fleet.ingest`).
 """
 
@@ -47,7 +47,7 @@ class Broker(Protocol):
         """What is there, at most `most`; none when nothing comes for so long."""
 
     async def close(self) -> None:
-        """Leave; what was not acknowledged is delivered again, to whoever comes next."""
+        """Disconnect; unacknowledged messages are delivered again."""
 
 
 @dataclass(slots=True)
@@ -67,7 +67,7 @@ async def consume(
     counts: ConsumerCounts,
     alive: Callable[[], None] = lambda: None,
 ) -> None:
-    """Take messages until told to stop; `alive` is called every second or so, between transactions."""
+    """Consume messages until stopped; `alive` is called every second or so, between transactions."""
     while not stopping.is_set():
         alive()
         deliveries = await broker.fetch(TOGETHER, WAIT_SECONDS)

@@ -1,4 +1,4 @@
-"""Numbers of estimates as few bytes: what is kept is told in `service.fleet.message`, how in here.
+"""Compact encoding of estimates; `service.fleet.message` defines their contents.
 
 Everything is rounded in units of its own uncertainty, so that what rounding adds is known beforehand.
 """

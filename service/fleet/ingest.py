@@ -1,7 +1,7 @@
-"""Estimates from elsewhere into trackers and store: in order of time, each window once, whoever brings it how often.
+"""Estimates from elsewhere into trackers and store: in order of time, each window once despite redelivery.
 
 At-least-once delivery becomes one effect: a transaction holds the vehicle, leaves out what is stored or waits already,
-folds what is due, keeps the rest waiting, and commits all of it together.  The sender is told after that.
+folds due windows, keeps the rest waiting, and commits all of it together.  The sender is answered after that.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class Ingest:
                 log.exception("windows that wait could not be folded; trying again")
 
     def sweep(self) -> int:
-        """Fold what has waited for long enough though nothing came after it; how many windows."""
+        """Fold windows that have waited long enough; their number."""
         now = self._clock()
         with self._pipeline.store.read() as connection:
             models = self._pipeline.engines.models_in_use(connection)
@@ -125,7 +125,7 @@ class Ingest:
     def _fold_due(
         self, connection: Connection, messages: Sequence[Message], held: Mapping[str, HeldVehicle], now: int
     ) -> list[tuple[Taken, Folded | None]]:
-        """Fold what is due of what waited and what came of some vehicles, each once; keep the rest."""
+        """Fold the due windows of some vehicles, waiting and new ones, each once; keep the rest."""
         models = {message.vehicle: held[message.vehicle].served.model_id for message in messages}
         waited = pending.waiting(connection, models)
         dues = [
@@ -155,7 +155,9 @@ class Ingest:
         held = {row.start: row for row in waited if row.start not in known}
         came = {w.start: w for w in fresh if w.start not in held}
         stepped_back = next((i for i, w in enumerate(fresh) if w.new_segment and w.start <= last), None)
-        if stepped_back is not None:  # the clock was set: what waits is from before, then the rest as it came
+        if (
+            stepped_back is not None
+        ):  # the clock was set back: waiting windows are older, then the rest in order of arrival
             due = sorted((*held, *(w.start for w in fresh[:stepped_back] if w.start in came)))
             due += [w.start for w in fresh[stepped_back:] if w.start in came]
         else:
@@ -256,7 +258,7 @@ def due_windows(received: dict[int, int], last: int, hop: float, late: int, now:
 
 
 def read_messages(bodies: Sequence[bytes]) -> list[Message]:
-    """Messages as they were sent.  Raises UserError for what is none."""
+    """Decoded messages.  Raises UserError for invalid ones."""
     try:
         return [decode(body) for body in bodies]
     except UnreadableMessage as error:

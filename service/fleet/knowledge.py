@@ -1,4 +1,4 @@
-"""What a fleet tells about its vehicles: what is usual, who departs, who gets worse, and who will cross a limit.
+"""Statistics of a fleet: usual values, outliers, trends, and predicted crossings of limits.
 
 Levels y are log-ratios to nominal with standard deviation s.  Pure functions of arrays; the store gives them
 (`service.store.levels`).
@@ -31,7 +31,7 @@ HORIZON_DAYS = 1000.0
 QUANTILES = (0.05, 0.5, 0.95)
 LEAST_POINTS = 3  # of a trend
 LEAST_VEHICLES = 3  # of a class that has a common mode
-LEAST_CHANGE = 1e-4  # log-ratio, of a common mode that is told
+LEAST_CHANGE = 1e-4  # log-ratio, of a common mode that is reported
 LEAST_DAYS, LEAST_KELVIN = 6, 3.0  # of a line over temperature
 ONE_SIDED_95 = 1.645
 
@@ -58,7 +58,7 @@ class Standing:
     level: float  # newest log-ratio
     std: float
     usual: float  # of its type and class
-    departure: float  # level - usual, in standard deviations of what is usual
+    departure: float  # level - usual, in standard deviations of the class
     slope: float  # log-ratio a day, common mode taken out; NaN where there are too few points
     slope_std: float
     crossing_days: tuple[float | None, ...]  # until it is `limit` off its own mean: 5 %, 50 %, 95 %
@@ -74,7 +74,7 @@ class CommonMode:
     time: int  # ns since epoch, begin of that part
     change: float  # log-ratio
     std: float
-    temperature: float  # degC, mean of those that measured it; NaN where nobody did
+    temperature: float  # degC, mean over vehicles that measure it; NaN if none does
 
     @property
     def sure(self) -> bool:
@@ -84,7 +84,7 @@ class CommonMode:
 
 @dataclass(frozen=True, slots=True)
 class TemperatureEffect:
-    """How what the vehicles of a class do together follows the temperature."""
+    """Dependence of a class's common mode on the temperature."""
 
     vehicle_class: str
     kind: str
@@ -105,7 +105,7 @@ class FleetKnowledge:
 
 
 def kind_of(parameter: str) -> str:
-    """The type of a parameter: its name without what tells elements of a type apart (secondary_1l.damping)."""
+    """The type of a parameter: its name without the numbers of elements (secondary_1l.damping)."""
     element, _, quantity = parameter.rpartition(".")
     return f"{re.sub(r'_?[0-9]+[a-z]?$', '', element) or element}.{quantity}"
 
@@ -113,7 +113,7 @@ def kind_of(parameter: str) -> str:
 def knowledge(
     found: FleetLevels, names: Sequence[str], known_std: float, limit: float, days: Sequence[float] = (30, 90, 365)
 ) -> FleetKnowledge:
-    """Everything that `found` tells.
+    """All statistics of `found`.
 
     known_std: a level less sure than this is the prior and no measurement; limit: change of the log-ratio from the
     vehicle's own first level that counts as crossed; days: for which the probability of crossing is given.
@@ -160,7 +160,7 @@ def knowledge(
 
 
 def worst(standings: Sequence[Standing], count: int) -> list[Standing]:
-    """Those that depart most from what is usual, in what is surely departed."""
+    """The largest significant departures from the usual value."""
     return sorted(standings, key=lambda one: -abs(one.departure))[:count]
 
 

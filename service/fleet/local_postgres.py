@@ -60,7 +60,7 @@ class PostgresServer:
                   " ".join(options), "start")  # fmt: skip
 
     def stop(self, mode: str = "immediate") -> None:
-        """Stop; `immediate` leaves what a power cut would."""
+        """Stop; `immediate` behaves like a power cut."""
         self._run("pg_ctl", "-D", str(self.folder / "data"), "-m", mode, "-w", "stop", check=False)
 
     def pid(self) -> int:

@@ -21,7 +21,7 @@ from sprung.service.fleet.tasks import Tasks, WorkLost
 from sprung.service.settings import Settings
 
 AHEAD = 4  # recordings a core that are handed over before their turn
-DONE = "done.json"  # in a report's folder, written last: what was diagnosed with what, and what it came to
+DONE = "done.json"  # in a report's folder, written last: inputs and result of the diagnosis
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def diagnose_many(
     Raises UserError for a place, a system file or a folder that cannot be used.
     """
     found = list_recordings(place)
-    system = load_system(settings.system or MANCHESTER)  # told once, not once a recording
+    system = load_system(settings.system or MANCHESTER)  # reported once, not per recording
     if out.exists() and not out.is_dir():
         raise UserError(f"{out}: is no folder")
     out.mkdir(parents=True, exist_ok=True)
@@ -73,7 +73,7 @@ def diagnose_many(
 
 
 def diagnose_file(order: DiagnosisOrder) -> DiagnosedFile:
-    """Diagnose one recording and write its report.  Whatever is wrong with one recording is told of that recording."""
+    """Diagnose one recording and write its report.  Errors are reported per recording."""
     settings, file, out = order.settings, order.file, order.out
     try:
         system = load_system(settings.system or MANCHESTER)

@@ -1,4 +1,4 @@
-"""What travels from an edge or an identifying replica to whoever folds it: estimates of one vehicle's windows.
+"""Messages from an edge or an identifying replica to the folding service: estimates of one vehicle's windows.
 
 MessagePack, compressed with zlib.  Two codings of the numbers: `exact` (float64, so that folding elsewhere gives the
 very same posterior) and `small`, for links that cost money:

@@ -1,4 +1,4 @@
-"""NATS JetStream before the service: vehicles store and forward into a stream on disk, whoever folds takes from it."""
+"""NATS JetStream before the service: vehicles store and forward into a stream on disk, which the service consumes."""
 
 from __future__ import annotations
 
@@ -159,13 +159,13 @@ async def _connected(servers: str) -> Any:
         return await asyncio.wait_for(connecting, FIRST_ANSWER_SECONDS)
     except (Error, OSError) as error:
         reason = str(refused[0]) if refused else type(error).__name__
-        raise UserError(f"{where}: no NATS server answers, or it lets nobody in ({reason})") from error
+        raise UserError(f"{where}: no NATS server answers, or it refuses access ({reason})") from error
     except ValueError as error:
         raise UserError(f"{where}: give an address as in nats://USER:PASSWORD@HOST:4222 ({error})") from error
 
 
 def without_password(address: str) -> str:
-    """An address as it may be printed: whoever reads a log learns no password."""
+    """An address for logs, without its password."""
     return re.sub(r"(?<=://)[^/@]*@", "", address)
 
 

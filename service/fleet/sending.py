@@ -35,10 +35,10 @@ class Link(Protocol):
     """A way to the server."""
 
     def send(self, entry: SpoolEntry) -> Answer:
-        """One attempt; never raises for what a network does."""
+        """One attempt; never raises for network errors."""
 
     def close(self) -> None:
-        """Give back what it holds open."""
+        """Close connections."""
 
 
 class HttpLink:
@@ -182,7 +182,7 @@ class Sending:
                 self._spool.done(entry)
                 continue
             if not self.trouble:
-                log.warning("the server takes nothing (%s); what is made waits", answer.trouble)
+                log.warning("the server accepts nothing (%s); messages wait", answer.trouble)
             self.trouble = answer.trouble
             self._stopping.wait(max(answer.wait, pause * random.uniform(0.5, 1.0)))
             pause = min(2.0 * pause, LAST_PAUSE)

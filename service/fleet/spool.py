@@ -51,7 +51,7 @@ class Spool:
             self._file.execute("PRAGMA synchronous = FULL")
             self._file.executescript(TABLES)
         except (sqlite3.Error, OSError) as error:
-            raise UserError(f"{path}: cannot hold what is to be sent ({error})") from error
+            raise UserError(f"{path}: cannot hold messages to be sent ({error})") from error
 
     def add(self, kind: Kind, body: bytes, name: str = "", **facts: Any) -> int:
         """Keep something to send, and facts with it, all or nothing; how many older entries made room for it."""

@@ -32,10 +32,10 @@ class Tasks(Protocol):
         """Have work done; arguments that `submit` returned stand for their results.  What stands for the result."""
 
     def result(self, pending: Any) -> Any:
-        """Wait for a result; raises what the work raised, WorkLost where it ended its process."""
+        """Wait for a result; raises the error of the work, or WorkLost if its process died."""
 
     def close(self) -> None:
-        """Let go of what was started for it."""
+        """Release what was started for it."""
 
 
 class HereTasks:
@@ -93,7 +93,7 @@ class RayTasks:
         except self._ray.exceptions.RayTaskError as error:
             if not isinstance(error.cause, self._ray.exceptions.RayError):  # else of what the work depended on
                 raise error.cause from None  # as it was raised, without the worker's traceback in its text
-            raise WorkLost(f"what came before it was lost ({type(error.cause).__name__})") from None
+            raise WorkLost(f"its input was lost ({type(error.cause).__name__})") from None
         except self._ray.exceptions.RayError as error:
             lost = f"its process ended {RETRIES + 1} times ({type(error).__name__}): too little memory?"
             raise WorkLost(lost) from None

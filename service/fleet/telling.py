@@ -1,4 +1,4 @@
-"""What the fleet tells, kept for ten minutes: it changes over days, and reads much."""
+"""Cache of the fleet's statistics for ten minutes: they change over days and read much data."""
 
 from __future__ import annotations
 

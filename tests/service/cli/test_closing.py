@@ -32,4 +32,4 @@ def test_wrong_sensors_and_loads_are_told_below_the_table() -> None:
 def test_a_load_from_before_a_stop_says_so() -> None:
     found = {"sensors": [], "load": {"car": [-4038.3, 360.9]}, "load_as_of": "2026-11-23T10:03:12Z"}
     (line,) = measurement_lines(found)
-    assert line == "load: car -4038 ± 361 kg against nominal, as of 2026-11-23T10:03:12Z; nothing since tells of it"
+    assert line == "load: car -4038 ± 361 kg against nominal, as of 2026-11-23T10:03:12Z; not observable since"

@@ -60,7 +60,7 @@ def test_a_full_spool_gives_up_recordings_then_the_oldest_estimates(tmp_path: Pa
 
 
 def test_a_place_that_cannot_be_used_is_one_clear_line() -> None:
-    with pytest.raises(UserError, match="cannot hold what is to be sent"):
+    with pytest.raises(UserError, match="cannot hold messages to be sent"):
         Spool(Path("/proc/nowhere/edge.db"), 1000)
     with pytest.raises(UserError, match="https://sprung"):
         HttpLink("sprung.example.org", None, "a")

@@ -47,7 +47,7 @@ def test_a_page_never_repeats_a_path_as_markup(client: TestClient) -> None:
 def test_what_is_sent_wrongly_is_answered_to_programs(client: TestClient) -> None:
     assert client.post("/identify", json={}, headers=BROWSER).headers["content-type"] == "application/problem+json"
     wrong = client.get("/pages/alarms?actve=false", headers=BROWSER)
-    assert wrong.status_code == 422 and "actve is no query parameter here" in wrong.text
+    assert wrong.status_code == 422 and "actve is not a query parameter here" in wrong.text
 
 
 @pytest.fixture
