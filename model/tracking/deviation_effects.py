@@ -118,8 +118,12 @@ class DeviationEffects:
         belief: kalman.Belief,
         *,
         armed: bool,
+        settled: bool,
     ) -> dev.DeviationRecord:
-        """Record with sensitivities and reference of the baseline after a window; `armed`: the baseline is known."""
+        """Record with sensitivities and reference of the baseline after a window.
+
+        armed: the baseline is known; settled: no deviation is jumping.
+        """
         if not self.model.size:
             return calibration
         first = state.changes.learned < self.settings.learning  # later refinements use corrected windows
@@ -127,6 +131,8 @@ class DeviationEffects:
         gained = np.where(first & (tested.weight > 0), more, 0.0)
         base = calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
         calibration = replace(calibration, base_cross=base)
+        if self._refining(state) and armed and not settled:
+            return calibration
         if self._refining(state):
             return dev.update_reference(calibration, self.model, belief, ~self.model.cargo & armed)
         # Constants of bodies never change: the baseline was learned with those that are known by now.

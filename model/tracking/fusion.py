@@ -33,6 +33,7 @@ HARMLESS = (
 )
 QUIET = 5.0  # log-likelihood ratio of a change above which a parameter's windows are not used to learn slopes
 INFORMATIVE = 0.5  # weight of a window below which its scatter comes from noise, not from unmodelled dynamics
+SETTLING = 20.0  # s after a jump of a deviation: until then the belief may have shared it out among channels
 KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
 
 
@@ -99,6 +100,8 @@ class Fusion:
         window = in_linear_scale(window, belief)
         filtered = self._filtered(state, belief, calibration, window)
         weather, tested = self._tested(state, calibration, conditions, window, filtered)
+        lately = any(a.kind == "sensor" and (centre - a.opened) * 1e-9 < SETTLING for a in state.alarms)
+        settled = jump is None and not lately and calibration.ratio.max(initial=0.0) < dev.SUSPECTED
         new = replace(
             state,
             last=time_ns,
@@ -109,7 +112,7 @@ class Fusion:
             innovation=filtered.innovation,
             changes=tested,
             calibration=self.effects.learned(
-                state, tested, calibration, window.cross, filtered.belief, armed=self.armed(state)
+                state, tested, calibration, window.cross, filtered.belief, armed=self.armed(state), settled=settled
             ),
             weather=weather,
             cargo=cargo,

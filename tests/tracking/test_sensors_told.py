@@ -257,3 +257,22 @@ def test_a_body_that_is_heavier_is_named_with_the_springs_and_dampers_at_it(
         state = tracker.update(state, estimate(value, covariance), EPOCH + k * SECOND)
     assert {a.parameter for a in state.alarms} == {n for n, o in zip(names, off, strict=True) if o}
     assert all(a.alternatives == rivals for a in state.alarms)
+
+
+def test_the_baseline_keeps_its_gains_and_delays_while_a_jump_may_still_be_shared_out_among_channels() -> None:
+    """A channel that takes part of another's jump before its own is found would else keep that part as its normal."""
+    tracker, state, rng = copy.deepcopy(learned(60))
+    wrong = np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0])
+    before, rested = state, []
+    for k in range(60, 100):
+        before, state = state, tracker.update(state, gained(rng, wrong), EPOCH + k * SECOND)
+        opened = [a.opened for a in state.alarms if a.kind == "sensor"]
+        if opened:
+            rested.append((k * SECOND + EPOCH - opened[0], np.array_equal(*_references(before, state))))
+    assert [a.parameter for a in state.alarms] == ["c1.gain"]
+    assert all(rests for since, rests in rested if since < 19 * SECOND)
+    assert not any(rests for since, rests in rested if since > 25 * SECOND)
+
+
+def _references(before: TrackerState, after: TrackerState) -> tuple[FloatArray, FloatArray]:
+    return before.calibration.reference, after.calibration.reference
