@@ -250,17 +250,21 @@ def incomplete_line(path: Path, fed: Fed) -> str | None:
     if fed.lost:
         parts.append(f"{fed.lost} of {fed.expected} samples lost ({100 * fed.lost / max(fed.expected, 1):.2g} %)")
     bad = {name: count for name in ("dropped", "corrupt") if (count := fed.tally.as_dict()[name])}
-    parts += [f"{count} messages {name}" for name, count in bad.items()]
+    parts += [f"{_counted(count, 'message')} {name}" for name, count in bad.items()]
     if fed.windows["repaired"]:
-        parts.append(f"{fed.windows['repaired']} windows repaired")
+        parts.append(f"{_counted(fed.windows['repaired'], 'window')} repaired")
     if fed.windows["dropped"]:
         why = ", ".join(f"{reason}: {count}" for reason, count in fed.reasons.most_common(3))
-        parts.append(f"{fed.windows['dropped']} windows dropped ({why})")
+        parts.append(f"{_counted(fed.windows['dropped'], 'window')} dropped ({why})")
     if fed.late:
-        parts.append(f"{fed.late} windows not tracked, for they are older than what was known of {fed.vehicle}")
+        parts.append(f"{_counted(fed.late, 'window')} not tracked: older than what was known of {fed.vehicle}")
     parts += fed.problems[:3] if fed.incomplete else []
     if not parts:
         return None
     total = sum(fed.windows.values())
     verdict = "incomplete" if fed.monitored else "not monitored"
-    return f"{path}: {verdict}: {', '.join(parts)}; {total} windows in all"
+    return f"{path}: {verdict}: {', '.join(parts)}; {_counted(total, 'window')} in all"
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"

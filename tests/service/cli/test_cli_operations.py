@@ -22,7 +22,7 @@ from sprung.model.system import MANCHESTER
 from sprung.service.cli import describe, main
 from sprung.service.cli.doctor import _bus
 from sprung.service.cli.parameters import parameter_table
-from sprung.service.cli.replay import slower_line, told_when_interrupted
+from sprung.service.cli.replay import incomplete_line, slower_line, told_when_interrupted
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.views import vehicle_view
 from sprung.service.sources.feed import Fed
@@ -208,6 +208,14 @@ def test_a_replay_that_is_slower_than_asked_says_so() -> None:
     )
     assert slower_line(fed, 5.2) is None  # it kept up
     assert slower_line(fed, 0.0) is None  # as fast as possible
+
+
+def test_what_a_recording_lost_is_counted_in_words() -> None:
+    fed = Fed("a", Counter(used=8, repaired=1, dropped=1), Counter({"gap in x": 1}), late=2)
+    assert incomplete_line(Path("a.mcap"), fed) == (
+        "a.mcap: incomplete: 1 window repaired, 1 window dropped (gap in x: 1), 2 windows not tracked: older than what "
+        "was known of a; 10 windows in all"
+    )
 
 
 def test_an_empty_standard_input_is_told_by_every_command_that_takes_one(
