@@ -34,7 +34,7 @@ class LawValue(Strict):
 LawSetting = dict[str, float | LawValue | str]  # parameter to value; text: `with`, `variant`, `formula`, `memory`
 Laws = Annotated[
     tuple[Annotated[dict[str, LawSetting], Field(min_length=1, max_length=1)], ...],
-    Field(description="what it does beyond its nominal behaviour: [{EFFECT: {PARAMETER: value}}]"),
+    Field(description="laws beyond its nominal behaviour: [{EFFECT: {PARAMETER: value}}]"),
 ]
 
 
@@ -66,15 +66,17 @@ class Address(Strict):
     )
 
     gain_std: float | None = Field(
-        default=None, ge=0, description="what the data sheet leaves to the gain, relative; default 0.015"
+        default=None, ge=0, description="relative standard deviation of the gain by the data sheet; default 0.015"
     )
     offset_std: float | None = Field(
         default=None,
         ge=0,
-        description="what it leaves to the zero, SI; default by the kind of quantity",
+        description="standard deviation of the zero by the data sheet, SI; default by the kind of quantity",
     )
     delay_std: float | None = Field(
-        default=None, ge=0, description="what it leaves to the delay against the other signals, s; default 0.002"
+        default=None,
+        ge=0,
+        description="standard deviation of the delay relative to other signals by the data sheet, s; default 0.002",
     )
 
     @field_validator("range")
@@ -118,7 +120,7 @@ class TimeKey(Strict):
     rate: float | None = Field(default=None, gt=0, description="samples per second of tables without a time column")
 
     def as_column(self) -> TimeColumn:
-        """What readers are told."""
+        """The column as readers need it."""
         unit = None if self.unit is None else FACTORS["s"][known(self.unit, "s") or "s"]
         epoch = None
         if isinstance(self.epoch, str):

@@ -1,4 +1,4 @@
-"""Ride comfort and running behaviour, as far as vertical accelerometers on the body tell, minute by minute.
+"""Ride comfort and running behaviour per minute, from vertical accelerometers on the body.
 
 - EN 12299 / ISO 2631-4: accelerations weighted by W_b, rms of 5 s; N_MV = 6 times their 95th percentile over at least
   5 min where all three axes are measured.  Here only its vertical part.
@@ -28,7 +28,7 @@ LEAD = 5.0  # s before a minute in which the weighting's transient dies away
 ENOUGH_BLOCKS = 60  # of 5 s, for a mean comfort value
 PERCENTILES = (0.15, 99.85)  # EN 14363
 BAND = (0.4, 10.0)  # Hz, EN 14363
-ROUGHNESS = 2.741619e-7  # b0 of ERRI B176, low level, for what a change of the vehicle costs
+ROUGHNESS = 2.741619e-7  # b0 of ERRI B176, low level, for the effect of changes of the vehicle
 OMEGA = 2 * np.pi * np.geomspace(0.1, 50.0, 600)  # rad/s
 
 
@@ -121,7 +121,7 @@ class RideQuality:
         self.names = tuple(system.sensors[i] for i in self.sensors)
         self.minutes: deque[Minute] = deque(maxlen=most)
         self._held = np.empty((0, len(self.columns)))
-        self._next: int | None = None  # ns, of the sample that continues what is held
+        self._next: int | None = None  # ns, of the sample that continues the held ones
 
     def push(self, start: int, values: FloatArray) -> None:
         """The window (T, C) that starts at `start`, ns; an absent sensor stays absent for that minute."""

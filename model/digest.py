@@ -29,7 +29,7 @@ def digest_of(file: SystemFile, on_track: bool) -> str:
     for source in keep["inputs"].values():
         if source["kind"] == "support":
             source["kind"] = "displacement"
-    keep.pop("signals")  # what no window sees
+    keep.pop("signals")  # without influence on windows
     for element in keep["elements"].values():
         element.pop("depends_on")
     added = [(source, "acceleration") for source in keep["inputs"].values()]  # keys that older files do not have

@@ -23,7 +23,7 @@ class LoadState:
     name: str  # "car.load"
     body: str
     empty: float  # kg, the mass of the system file
-    declared: bool  # the system file says so
+    declared: bool  # stated in the system file
     std: float  # of the logarithm of mass over `empty`, before any window
     least: float | None = None  # kg that it may carry beside `empty`, by the system file
     most: float | None = None

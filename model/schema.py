@@ -1,4 +1,4 @@
-"""The system file: what it may say.
+"""Schema of the system file.
 
 A lumped mechanical system in YAML, SI units, x forward, y left, z up.  Format: docs/system-file.md; reading it:
 `model.systemfile`.
@@ -41,7 +41,7 @@ Quantity = Annotated[Value, BeforeValidator(_as_value, json_schema_input_type=fl
 
 
 class MassValue(Value):
-    """A mass, and how well it is known where nothing in a window tells it."""
+    """A mass, with its standard deviation if windows do not determine it."""
 
     std: float | None = Field(default=None, ge=0)  # kg, standard deviation; inertias go along
 
@@ -114,7 +114,7 @@ class SupportInput(Strict):
 
 
 class TrackInput(Strict):
-    """A support that nobody measures: a wheel on one of the rails, which the wheels before it have seen."""
+    """An unmeasured support: a wheel on one of the rails, excited like the wheels ahead with a delay."""
 
     kind: Literal["track"]
     rail: Literal["left", "right"]
@@ -176,7 +176,7 @@ class FollowedSignal(Address):
 
 
 class SystemFile(Strict):
-    """Everything a system file says, with references between its parts checked."""
+    """The contents of a system file, with checked references between its parts."""
 
     name: Annotated[str, Field(min_length=1, max_length=200), StringConstraints(strip_whitespace=True)]
     sample_rate: float = Field(gt=0)  # Hz
@@ -258,7 +258,7 @@ class Parts:
         )
 
     def problems(self) -> Iterator[str]:
-        """Each as `key: what is wrong`."""
+        """Errors, each as `key: error`."""
         yield from self._names()
         yield from self._elements()
         for name, source in self.inputs.items():

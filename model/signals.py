@@ -37,7 +37,7 @@ class Channel:
     column: str | None = None  # column or variable of any tabular file
     gain: float = 1.0  # value in `unit` = gain * recorded + offset
     offset: float = 0.0
-    range: tuple[float, float] | None = None  # possible values in `unit`; None: what the unit makes plausible
+    range: tuple[float, float] | None = None  # possible values in `unit`; None: by the unit
 
     @property
     def table(self) -> str | None:
@@ -47,7 +47,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class TimeColumn:
-    """Where tables keep the time and what it counts; None: to be found out from the file."""
+    """Time column of tables and its unit; None: detected."""
 
     name: str | None = None
     seconds: float | None = None  # one unit of it, s
@@ -78,12 +78,12 @@ class Window:
     reason: str | None = None  # why it was repaired or dropped
     repaired_samples: int = 0
     auxiliary: FloatArray | None = None  # mean of `System.auxiliary` while it lasts, shape (A,); NaN: not measured
-    new_segment: bool = False  # the first after the clock jumped: its time says nothing about what came before
+    new_segment: bool = False  # the first after a jump of the clock, without relation to earlier ones
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """How the vehicle runs during a window; NaN where nobody measures it."""
+    """Operating conditions of a window; NaN if not measured."""
 
     speed: float = math.nan  # m/s
     temperature: float = math.nan  # degC
@@ -111,7 +111,7 @@ class MeasurementFault:
 
 @dataclass(frozen=True, slots=True)
 class BuiltOtherwise:
-    """What windows tell of a body that is not what the system file states."""
+    """Estimated deviation of a body from the system file."""
 
     body: str
     what: str  # "mass", "roll inertia" ...
@@ -121,7 +121,7 @@ class BuiltOtherwise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deviating:
-    """What a window says about H deviations from the system file (gains, delays, loads) beside the P parameters.
+    """Evidence of a window on H deviations (gains, delays, loads) beside the P parameters.
 
     For deviations h the parameters are most likely N(x^ + cross (h - point), given), and the log-likelihood of h
     itself is score' (h - point) - (h - point)' information (h - point) / 2.
@@ -138,7 +138,7 @@ class Deviating:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What one window told about the P parameters: log-ratios to nominal, with their covariance."""
+    """Estimate of the P parameters from one window: log-ratios to nominal, with covariance."""
 
     log_ratio: FloatArray  # log(theta / nominal), shape (P,)
     covariance: FloatArray  # of log_ratio, shape (P, P); the prior's where not identifiable
@@ -153,7 +153,7 @@ class Estimate:
     outputs: FloatArray | None = None  # simulated sensors, shape (T, S), with the states of systems with laws
     deviating: Deviating | None = None  # where it was asked for, or refined elsewhere than at the system file
     faults: tuple[MeasurementFault, ...] = ()  # that had to be taken back before the window fitted
-    informative: bool = True  # False: too little excitation to tell anything, neither that it fits nor that it does not
+    informative: bool = True  # False: too little excitation for any conclusion
     running: bool = False  # though it is not informative, the vehicle was moved: its windows are too noisy, or alike
     noise: float = 0.0  # share of noise in what looks like information on the parameters; 0: negligible
     identified: bool = True  # False: there are no values, for the reason

@@ -41,9 +41,9 @@ DELAY_STD = 0.002  # s: filters, scheduling and clocks of nodes
 AXLE_STD = 0.03  # of an axle's mass that the file states without a deviation: wheels wear, and new ones are put on
 LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations
 USUAL_SPEED = 30.0  # m/s, taken for curves where only the yaw rate is measured
-COLDEST, HOTTEST = -70.0, 150.0  # degC; beyond, a probe is broken or short, and nobody knows the temperature
+COLDEST, HOTTEST = -70.0, 150.0  # degC; beyond, a probe is broken, and the temperature unknown
 _HELD = 1e-3  # Hz, a slower mode is one that nothing holds, but for rounding
-SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measures
+SHORTEST_TRACK = 10.0  # s, of a window of a vehicle with unmeasured wheels
 
 
 def _channel(name: str, quantity: str, at: Address) -> Channel:
@@ -99,7 +99,7 @@ class System:
 
     @property
     def hop(self) -> int:
-        """Samples between window starts; half a window unless the file says otherwise."""
+        """Samples between window starts; half a window by default."""
         return self.file.hop or max(1, self.file.window // 2)
 
     @cached_property
@@ -166,7 +166,7 @@ class System:
 
     @cached_property
     def auxiliary(self) -> tuple[Channel, ...]:
-        """Measured signals that say how the vehicle runs: `speed`, those of `RUNNING`, and `BODY.pressure` of loads."""
+        """Measured signals of operating conditions: `speed`, those of `RUNNING`, and `BODY.pressure` of loads."""
         channels = []
         if self._speed_measured and not self.on_track and self.file.speed is not None:
             channels.append(_channel("speed", "speed", self.file.speed))
@@ -208,7 +208,7 @@ class System:
 
     @cached_property
     def on_track(self) -> bool:
-        """Whether what moves it is a track that nobody measures."""
+        """Whether it runs on an unmeasured track."""
         return any(isinstance(source, TrackInput) for source in self.file.inputs.values())
 
     @property
@@ -256,7 +256,7 @@ class System:
 
     @cached_property
     def loads(self) -> tuple[LoadState, ...]:
-        """Bodies that carry passengers or goods: those that say `load`; else those on which nothing stands.
+        """Bodies that carry passengers or goods: those with `load`; else those that support no other body.
 
         A mass that is estimated, or fixed, is no load.
         """
@@ -287,7 +287,7 @@ class System:
 
     @cached_property
     def doubtful_masses(self) -> dict[str, float]:
-        """Bodies whose mass is not quite what the file says, with its relative standard deviation.
+        """Bodies with uncertain mass, with its relative standard deviation.
 
         Those for which the file states one, and axles: they stand on a support, carry another body and do not pitch;
         new wheels are heavier by several per cent than worn ones.  A mass that is a load, estimated or fixed is none.
@@ -410,7 +410,7 @@ def _unseen(mode: Mode) -> str:
 
 
 def unsupported(file: SystemFile) -> list[str]:
-    """What the format can say and identification cannot use yet, one line each."""
+    """Contents of a file that identification does not support, one line each."""
     found = []
     tracks = [name for name, source in file.inputs.items() if isinstance(source, TrackInput)]
     if tracks and len(tracks) < len(file.inputs):
@@ -428,7 +428,7 @@ def unsupported(file: SystemFile) -> list[str]:
     if tracks and seconds < SHORTEST_TRACK:
         least = round(SHORTEST_TRACK * file.sample_rate)
         found.append(
-            f"window: {seconds:g} s is too short to tell vehicle from track where no input is measured; "
+            f"window: {seconds:g} s is too short to distinguish vehicle and track without measured inputs; "
             f"{least} samples at the least, a minute ({round(60 * file.sample_rate)}) is usual"
         )
     return found

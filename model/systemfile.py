@@ -140,7 +140,7 @@ def parse_system_file(text: str, source: str = "system file") -> SystemFile:
 
 
 def _hidden(document: yaml.Node | None) -> list[tuple[int, str]]:
-    """Names and texts with characters that nobody sees; they end up on terminals, in logs and on pages."""
+    """Names and texts with invisible characters, which would end up on terminals, in logs and on pages."""
     found: list[tuple[int, str]] = []
     seen: set[int] = set()
     left = [document] if document is not None else []
@@ -153,7 +153,7 @@ def _hidden(document: yaml.Node | None) -> list[tuple[int, str]]:
             left += [part for item in node.value for part in (item if isinstance(item, tuple) else (item,))]
         elif character := hidden_character(node.value.removesuffix("\n")):  # what a block of text ends with
             line, text = node.start_mark.line + 1, node.value[:40]
-            found.append((line, f"{text!a}: holds a character that nobody sees ({character})"))
+            found.append((line, f"{text!a}: holds an invisible character ({character})"))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Characters that nobody sees, and that deceive who reads a name somewhere else: on a terminal, in a log, on a page."""
+"""Invisible and control characters in names, which are deceptive on terminals, in logs and on pages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _HIDDEN = re.compile(f"[{CONTROL}{UNSEEN}\U000e0000-\U000e007f]")  # tags, too
 
 
 def hidden_character(text: str) -> str:
-    """The first control character, or one that nobody sees, as `U+202E`; empty where there is none.
+    """The first control or invisible character, as `U+202E`; empty if there is none.
 
     >>> hidden_character("tram\\u202e 7")
     'U+202E'

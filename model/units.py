@@ -1,4 +1,4 @@
-"""Units of measurement that a system file may name, and what they are in SI.
+"""Units of measurement of system files, and their conversion to SI.
 
 The table is explicit rather than computed: every name that is accepted can be read here, and `g` means the
 acceleration for an accelerometer and the gram for a mass, as people write it.
@@ -35,8 +35,8 @@ FACTORS: dict[str, dict[str, float]] = {  # SI unit -> other names of it -> how 
     "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3, "lb": POUND},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0},
 }
-ZEROS = {"K": -273.15, "degF": -32.0}  # added to what is counted from another zero
-RAW: dict[str, float] = {  # what a transducer puts out: only a scale makes a quantity of it
+ZEROS = {"K": -273.15, "degF": -32.0}  # offsets of scales with another zero
+RAW: dict[str, float] = {  # outputs of transducers, which need a scale
     **{"V": 1.0, "mV": 1e-3, "uV": 1e-6, "A": 1.0, "mA": 1e-3, "Ohm": 1.0, "mV/V": 1e-3},
     **{"count": 1.0, "digit": 1.0, "LSB": 1.0, "%": 1e-2, "1": 1.0},
 }
@@ -52,7 +52,7 @@ _SAME = {
 
 
 class UnitError(ValueError):
-    """The unit is not known, or is none of the quantity; the message says which are."""
+    """The unit is unknown or does not fit the quantity; the message lists valid ones."""
 
 
 def spelt(unit: str) -> str:
@@ -103,7 +103,7 @@ def to_si(unit: str | None, si: str, scale: float | None, offset: float, sign: i
         offset += ZEROS.get(name, 0.0)
         return sign * gain * factor, sign * offset * factor
     if scale is None:
-        raise UnitError(f"{unit} alone says nothing about {si}; give `scale:` in {si} per {_per(name)}")
+        raise UnitError(f"{unit} alone does not determine {si}; give `scale:` in {si} per {_per(name)}")
     return sign * gain * RAW[name], sign * offset
 
 

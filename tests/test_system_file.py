@@ -52,9 +52,9 @@ def converted(system: System, name: str, recorded: float) -> float:
 @pytest.mark.parametrize("hidden", ["\\u202e", "\\x1b[31m", "\\u200b", "\\n"])
 def test_texts_with_characters_that_nobody_sees_are_refused(hidden: str) -> None:
     (problem,) = problems(RIG.replace("name: rig", f'name: "a{hidden}b"'))
-    assert problem.startswith("rig.yaml: line 2: ") and "nobody sees (U+" in problem and problem.isprintable()
+    assert problem.startswith("rig.yaml: line 2: ") and "invisible character (U+" in problem and problem.isprintable()
     (problem,) = problems(RIG.replace("column: acc", f'column: "a{hidden}b"'))
-    assert "nobody sees" in problem
+    assert "invisible character" in problem
     assert parse_system(RIG.replace("name: rig", "name: |\n  rig\n")).name == "rig"
 
 
@@ -110,7 +110,7 @@ def test_a_unit_of_something_else_is_refused_and_volts_need_a_scale() -> None:
         to_si("mm", "N", None, 0.0, 1)
     with pytest.raises(UnitError, match=r"did you mean 'kN'"):
         to_si("KN", "N", None, 0.0, 1)
-    with pytest.raises(UnitError, match=r"mV alone says nothing about N; give `scale:` in N per V"):
+    with pytest.raises(UnitError, match=r"mV alone does not determine N; give `scale:` in N per V"):
         to_si("mV", "N", None, 0.0, 1)
     assert to_si("mV", "N", 2000.0, 5.0, -1) == (-2.0, -5.0)
 

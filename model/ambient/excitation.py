@@ -1,4 +1,4 @@
-"""What is assumed about sources that nobody measures: their spectral matrix, with a few free numbers.
+"""Models of unmeasured excitation: spectral matrices with a few free values.
 
 Every excitation describes the X sources by local quantities of each group of bins (a rail's level, a coherence, ...),
 each of which is a smooth function over log-frequency with free values at nodes, or one number for all frequencies.

@@ -27,7 +27,7 @@ class Likelihood(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """The most probable point and what is known about it."""
+    """The maximum a posteriori point and its covariance."""
 
     x: FloatArray  # shape (P + Q,)
     covariance: FloatArray  # shape (P + Q, P + Q), prior included
@@ -38,7 +38,7 @@ class Fitted:
 
 
 def fit(likelihood: Likelihood, x: FloatArray, prior: Prior, free: BoolArray | None = None, limit: int = 40) -> Fitted:
-    """Scoring from `x` with a Gaussian prior; what is not `free` stays where it is and counts as known."""
+    """Scoring from `x` with a Gaussian prior; values that are not `free` are fixed and count as known."""
     chosen = np.flatnonzero(np.ones(len(x), dtype=bool) if free is None else free)
     precision = prior.std[chosen] ** -2.0
     damping, converged, iterations = 1e-3, False, 0

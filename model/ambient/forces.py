@@ -1,4 +1,4 @@
-"""Structures shaken by forces that nobody measures: wind, traffic, people, machines.
+"""Structures under unmeasured forces: wind, traffic, people, machines.
 
 Every degree of freedom carries a force of its own, independent of the others, with a free level L_i at a reference
 frequency w_0 and a common slope a over log-frequency: X_ij = d_ij L_i (w / w_0)^a.
@@ -12,7 +12,7 @@ from sprung.model.ambient.excitation import Prior, Sources
 from sprung.model.ambient.periodogram import Spectra
 from sprung.model.signals import FloatArray
 
-LEVEL_STD = 3.0  # of the logarithm of a level, about the one that the sensors' power tells
+LEVEL_STD = 3.0  # of the logarithm of a level, about the one estimated from the sensors' power
 SLOPE_STD = 1.0  # of the spectrum's slope about 0
 
 

@@ -1,4 +1,4 @@
-"""What a window will tell, before there is one: Fisher information at the nominal values."""
+"""Predicted precision of a window: Fisher information at the nominal values."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHAKEN = 1e4  # power of the signals over their noise, of a structure under ambi
 
 
 def foreseen(system: System) -> FloatArray:
-    """Standard deviation of each parameter's log-ratio after one window, (P,); `PRIOR_STD` where it tells nothing.
+    """Standard deviation of each parameter's log-ratio after one window, (P,); `PRIOR_STD` if not identifiable.
 
     An average track at the stated speed (or 42 m/s, unknown), or forces that lift the sensors far above their noise.
     """

@@ -191,7 +191,7 @@ def as_estimate(fit: AmbientFit, P: int, present: BoolArray) -> Estimate:
 
 
 def _silent(P: int, sensors: int) -> Estimate:
-    """The estimate of a window that tells nothing."""
+    """The estimate of an uninformative window."""
     return Estimate(
         log_ratio=np.zeros(P),
         covariance=np.eye(P) * PRIOR_STD**2,

@@ -41,7 +41,7 @@ class Responses:
         self.unknowns = (*system.parameters, *(_load(system, body) for body in loads))
         elements, bodies = list(system.elements), list(system.bodies)
         E, n = m.H.shape
-        self.place = np.zeros((len(self.unknowns), E + n))  # what an unknown scales
+        self.place = np.zeros((len(self.unknowns), E + n))  # elements and masses that an unknown scales
         self.derivative = np.zeros(len(self.unknowns), dtype=int)  # 0: of motion, 1: of its rate, 2: of acceleration
         for row, unknown in enumerate(self.unknowns):
             if unknown.quantity == "mass":

@@ -36,7 +36,7 @@ class Track:
     def excitation(self, inputs: FloatArray, found: Spectra, sensed: Sensing) -> TrackExcitation | None:
         """Wheels at the speed of the window; None where it is too slow.
 
-        inputs: the measured speed (T, 1), NaN where it is missing, or (T, 0) where the file states it or nobody does.
+        inputs: the measured speed (T, 1), NaN where it is missing, or (T, 0) if the file states it or it is unknown.
         """
         stated, measured = self.system.file.speed, inputs[np.isfinite(inputs)]
         speed = float(measured.mean()) if measured.size else (None if stated is None else stated.value)
@@ -52,7 +52,7 @@ class Track:
         return TrackExcitation(self.position, self.left, found, running)
 
     def _search(self, found: Spectra, sensed: Sensing, speed: float | None) -> float:
-        """The direction, and the speed where nobody knows it, under which the nominal vehicle explains a window best.
+        """The direction, and the speed if unknown, with which the nominal vehicle explains a window best.
 
         GNSS and odometers measure a speed without its direction.
         """

@@ -25,13 +25,13 @@ SHARES_PER_OCTAVE = 0.5
 USUAL_SHARE, SHARE_STD = 0.05, 1.5  # median of a wheel's own share; standard deviation of its logit
 LEAST_SHARE = 2e-3  # no wheel follows a delayed profile closer than this
 COHERENCE_STD = 1.0  # of the inverse hyperbolic tangent of the coherence
-LEVEL_STD = 3.0  # of the logarithm of a level, about the one that the sensors' power tells
+LEVEL_STD = 3.0  # of the logarithm of a level, about the one estimated from the sensors' power
 USUAL_COHERENCE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """How fast the vehicle runs; `std` infinite if nobody knows.  Negative speed: towards -x."""
+    """Speed of the vehicle; `std` is infinite if unknown.  Negative speed: towards -x."""
 
     speed: float  # m/s
     std: float  # m/s

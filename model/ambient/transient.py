@@ -1,6 +1,6 @@
-"""Windows of a structure that nobody's measurement excites: how they begin and end is modelled, not tapered away.
+"""Output-only windows of a structure: transients at their ends are modelled instead of tapered.
 
-The transform of a whole window, without taper, of a structure under white forces W that nobody measured is exactly
+The transform of a whole window, without taper, of a structure under unmeasured white forces W is exactly
 
     Y(w) = A(w) W(w) + T(w) b + V(w),      S(w) = A(w) diag(L) A(w)^H + r^2
 
@@ -35,8 +35,8 @@ NYQUIST = 0.4  # of the sample rate, where anti-aliasing filters begin
 LEAKS = (-1, 0, 1, 2, 3)  # powers of j w: from below the band, from above, and of what sampling folds back
 DECAYING = 15.0  # logarithm by which forces are weaker when a free decay is tried
 FIRST, LAST = 20, 100  # steps from every start, and from the best of them
-FEWEST = 12  # bins that tell anything
-LEVEL_STD = 3.0  # of the logarithm of a force's level about the one that the signals' power tells
+FEWEST = 12  # least number of bins
+LEVEL_STD = 3.0  # of the logarithm of a force's level about the one estimated from the signals' power
 NOISE_STD = 3.0  # of that of the noise power about the declared one
 STIFFER = np.linspace(-1.0, 1.0, 41)  # common log-ratios of all stiffnesses that are tried as starts
 BLURRED = 0.15  # damping ratio with which they are compared first
@@ -52,7 +52,7 @@ class TransientFit:
     fitted: Fitted  # x: log-ratios, log-levels of the forces' power, logarithm of the noise power over the declared
     frequency: FloatArray  # of the compared bins, Hz, shape (F,)
     whole: FloatArray  # power of every sensor's bins, shape (F, S)
-    rest: FloatArray  # of it without what the ends leave, shape (F, S)
+    rest: FloatArray  # of it without the transients of the ends, shape (F, S)
     expected: FloatArray  # of the rest, by the model, shape (F, S)
     noise_share: FloatArray  # of every sensor's rms that the model takes for noise, shape (S,)
     misfit: float  # largest deviation of a part of the band from its expectation, in standard deviations
@@ -64,7 +64,7 @@ class TransientFit:
 
     @property
     def covariance(self) -> FloatArray:
-        """Of all of x; what the model cannot follow is treated as more noise."""
+        """Covariance of x; misfit counts as additional noise."""
         return self.fitted.covariance * max(1.0, self.misfit / USUAL) ** 2
 
 
@@ -74,7 +74,7 @@ class _Whitened:
 
     response: Response
     white: np.ndarray  # S^-1/2, (F, R, R)
-    basis: FloatArray  # orthonormal, of what the ends can show, (2 F R, 2 n + leaks R)
+    basis: FloatArray  # orthonormal, of the transients, (2 F R, 2 n + leaks R)
     ends: FloatArray  # b, (2 n + leaks R,)
     residual: np.ndarray  # (F, R)
     cost: float
@@ -121,7 +121,7 @@ class TransientLikelihood:
         return self._at(x).cost
 
     def _at(self, x: FloatArray) -> _Whitened:
-        """The whitened bins at a point, what the window's ends explain of them projected out."""
+        """The whitened bins at a point, with the transients of the ends projected out."""
         response = self.responses.at(x[: self.P], self.omega)
         A, jw = response.signals, (1j * self.omega)[:, None, None]
         S = (A * np.exp(x[self.P : -1])) @ adjoint(A) + np.exp(x[-1]) * np.eye(A.shape[1])

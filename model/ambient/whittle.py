@@ -109,5 +109,5 @@ def adjoint(matrix: np.ndarray) -> np.ndarray:
 
 
 def _centre(sides: np.ndarray) -> np.ndarray:
-    """Means of what was computed at a group's two frequencies."""
+    """Means over the two frequencies of each group."""
     return np.asarray(sides.reshape(2, -1, *sides.shape[1:]).mean(axis=0))

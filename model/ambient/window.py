@@ -20,9 +20,9 @@ from sprung.model.system import System
 LOWEST = 0.75  # of the lowest natural frequency, where the band begins
 HIGHEST = 0.36  # of the sample rate: anti-aliasing filters begin above
 LONGEST = 4.0  # periods of the band's lower edge that a window holds, at least
-EXCESS = 4.0  # power over noise, below which a sensor tells nothing
+EXCESS = 4.0  # power over noise, below which a sensor is uninformative
 OCTAVES = 1.0  # of band, and
-GROUPS = 12  # of bins, below which a window tells nothing
+GROUPS = 12  # of bins, below which a window is uninformative
 SHARPEST, BLUNTEST = 0.002, 0.03  # width of a group of bins over its frequency
 BLURS = (0.1, 0.01, 0.001)  # see `Whittle`; steps on the way to none
 RIGID = 1e-6  # of the highest natural frequency: slower modes are motions of the whole without any spring
@@ -157,7 +157,7 @@ class WindowFit:
 
 
 def _noise_share(fitted: Fitted, found: Spectra, sensed: Sensing) -> FloatArray:
-    """Share of every sensor's rms that the model takes for noise, (S,): what is left after the most likely motion."""
+    """Share of every sensor's rms that the model takes for noise, (S,): the residual of the most likely motion."""
     left = sensed.rows.T @ np.linalg.inv(fitted.at.covariance) @ sensed.rows + sensed.spare.T @ sensed.spare
     left = sensed.noise[:, None] ** 2 * left  # R S^-1, (F, S, S)
     error = np.einsum("f,fij,fjk,fik->i", found.weight, left, found.matrix, left.conj(), optimize=True).real

@@ -72,7 +72,7 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
     given = {key: _matrix(path, key, data[key]) for key in _KEYS if key in data}
     sampled = rate if rate is not None else _number(given, "sample_rate")
     if sampled is None:
-        raise ExchangeError(f"{path}: no sample_rate; say at how many Hz the recordings are by --rate")
+        raise ExchangeError(f"{path}: no sample_rate; give the rate of the recordings in Hz by --rate")
     _check_rate(path, sampled)
     found = _from_state_space(path, given) if "A" in given else _from_mck(path, given)
     text = _text(found, name or path.stem, sampled, _given_names(path, data, found))
@@ -81,7 +81,7 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
 
 
 def _given_names(path: Path, data: Mapping[str, Any], found: SpringNetwork) -> _Names:
-    """What `states`, `inputs` and `outputs` of a .mat file say, as `--export` writes them; empty where they do not."""
+    """`states`, `inputs` and `outputs` of a .mat file, as written by `--export`; empty if absent."""
     n, supports = found.Kb.shape
     states, inputs, outputs = (_texts(data.get(name)) for name in ("states", "inputs", "outputs"))
     if inputs is not None and len(inputs) == 2 * supports:  # displacement and velocity of one support after the other
@@ -108,7 +108,7 @@ def _texts(value: Any) -> tuple[str, ...] | None:
 def _from_fmu(path: Path, name: str | None, rate: float | None) -> str:
     """The text of a system file from an FMU's A, B, C."""
     if rate is None:
-        raise ExchangeError(f"{path}: say at how many Hz the recordings are by --rate")
+        raise ExchangeError(f"{path}: give the rate of the recordings in Hz by --rate")
     _check_rate(path, rate)
     linear = read_fmu(path)
     network = _from_state_space(path, {"A": linear.A, "B": linear.B, "C": linear.C}, _DIFFERENCES)
@@ -321,8 +321,8 @@ def _text(found: SpringNetwork, name: str, rate: float, names: _Names) -> str:
     sensors: dict[str, dict[str, Any]] = {}
     for kind, i, j in found.sensors:
         key, entry = _sensor(kind, i, j, body, elements)
-        told = sum(one == key or one.startswith(f"{key}_") for one in sensors)  # two sensors may measure the same
-        key = f"{key}_{told + 1}" if told else key
+        count = sum(one == key or one.startswith(f"{key}_") for one in sensors)  # two sensors may measure the same
+        key = f"{key}_{count + 1}" if count else key
         sensors[key] = entry | {"csv": key}
     if names.outputs:
         called = zip(_plain(names.outputs), names.outputs, found.sensors, strict=True)

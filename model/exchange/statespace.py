@@ -43,7 +43,7 @@ class StateSpace:
     parameters: tuple[str, ...]
     values: FloatArray  # of the parameters, (P,)
     sample_rate: float  # Hz, of the recordings; the matrices are of continuous time
-    mass: FloatArray  # mass or inertia of each degree of freedom, the scale that A and B do not tell, (N / 2,)
+    mass: FloatArray  # mass or inertia of each degree of freedom, the scale that A and B do not determine, (N / 2,)
 
 
 def state_space(system: System, values: Mapping[str, float] | None = None) -> StateSpace:

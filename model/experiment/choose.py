@@ -1,4 +1,4 @@
-"""The menu's runs in the order of what they tell models apart by."""
+"""Ranking of runs by their expected power to discriminate between models."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SEED = 0  # of the runs that are simulated: the same menu is ranked alike every
 
 @dataclass(frozen=True, slots=True)
 class RankedRun:
-    """One run and what it promises."""
+    """One run with its expected evidence."""
 
     run: str
     evidence: float  # expected log-likelihood ratio for the truth, of the pair that it parts worst
@@ -30,7 +30,7 @@ def rank_runs(
     known: float = KNOWN,
     tell: Callable[[str], None] = lambda line: None,
 ) -> list[RankedRun]:
-    """Every run of the menu, the one that tells most for its cost first.
+    """Runs of the menu, by expected evidence per cost.
 
     Either of two models may be true: a run counts by the mean of both, and among several models by its worst pair.
     """

@@ -1,4 +1,4 @@
-"""What a run would tell two models apart by: the expected logarithm of their likelihood ratio.
+"""Expected evidence of a run between two models: the expected logarithm of their likelihood ratio.
 
 If A is true, B is fitted to what A would show.  Where B's best values leave a misfit of D (half the whitened squares,
 windows and what is known of the values before together), the log-likelihood ratio of the run is normal with mean D and
@@ -67,7 +67,7 @@ def simulated(system: System, run: MenuRun, seed: int = 0, noise: np.random.Gene
 
 
 def promise(truth: System, other: System, run: MenuRun, known: float = KNOWN, seed: int = 0) -> Promise:
-    """What a run tells against `other` where `truth` is true."""
+    """Expected evidence of a run against `other` if `truth` is true."""
     values = simulated(truth, run, seed)
     if not np.isfinite(values).all():  # too violent for the simulation itself
         return Promise(0.0, 0.0)

@@ -51,7 +51,7 @@ class MenuRun(Strict):
     signal: BenchSignal | None = None
     seconds: Annotated[float, Field(gt=0, le=600)] = 10.0
     load: dict[str, float] = Field(default_factory=dict)  # kg more in a body, its inertias in proportion
-    cost: Positive = 1.0  # in any unit; runs are compared by what they tell for it
+    cost: Positive = 1.0  # in any unit; runs are compared by evidence per cost
 
     @model_validator(mode="after")
     def _is_one_thing(self) -> MenuRun:

@@ -1,4 +1,4 @@
-"""Models that a recording could not tell from the one that was chosen: another law in the place of a finding."""
+"""Alternatives that a recording could not distinguish from the chosen model: another law in place of a finding."""
 
 from __future__ import annotations
 

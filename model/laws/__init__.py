@@ -1,4 +1,4 @@
-"""The catalogue of laws: what a system may do that its file does not say.  One table; docs/catalogue.md."""
+"""The catalogue of laws: possible behaviour beyond the nominal structure.  One table; docs/catalogue.md."""
 
 from __future__ import annotations
 

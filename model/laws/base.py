@@ -1,4 +1,4 @@
-"""What a law of the catalogue is: its parameters, its force, and what an engineer should know of it.
+"""Laws of the catalogue: parameters, force, and information for engineers.
 
 An element law adds a force to the k d + c v of its element:
 
@@ -50,7 +50,7 @@ class SpringDamper(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """What a recording says about the motion of one element: where knees, gaps and memories can be sought."""
+    """Sizes of an element's motion in a recording, which bound knees, gaps and yield displacements."""
 
     deflection: FloatArray  # quantiles 0, 1 %, ..., 100 % of abs(deflection), m, shape (101,)
     rate: FloatArray  # the same of abs(rate), m/s, shape (101,)
@@ -110,7 +110,7 @@ class ParameterSpec:
     log: bool = False  # positive by nature and of unknown order: fitted as a logarithm
     usual: tuple[float, float] = (0.0, float("inf"))  # range in multiples of `typical`, beyond which it is rare
     plausible: tuple[float, float] = (-float("inf"), float("inf"))  # beyond it the value stands for something else
-    minor: bool = False  # shapes a corner and says nothing about how strong the law is: not in its sentence
+    minor: bool = False  # shapes a corner without influence on the strength: omitted in sentences
     accuracy: float = 0.0  # of the value, no less than of `typical`: to which branches follow what it stands for
 
     def admits(self, value: float) -> bool:
@@ -127,7 +127,7 @@ class Parametrised:
     parameters: tuple[ParameterSpec, ...]
     prior_cost: float = 0.0  # evidence by which the law must beat commoner ones
     named: bool = True  # whether it is physics with a name
-    listed: bool = True  # False: only its formula, or the map of its force, tells what it is
+    listed: bool = True  # False: defined only by its formula or the map of its force
     fault: bool = False  # whether it is one of the measurement, not of the system
     nuisance: bool = False  # reported, and no reason for any verdict
 
@@ -144,7 +144,7 @@ class Maxwell(NamedTuple):
 
     stiffness: float  # N/m
     time: float  # s, damper over spring
-    replaces: float = 0.0  # N s/m, what of the element's own damper is in the branch
+    replaces: float = 0.0  # N s/m, the part of the element's damper in the branch
     of_spring: bool = False  # whether its stiffness is a share of the element's own
 
 
@@ -202,7 +202,7 @@ class ElementLaw(Parametrised):
     turns_over: Callable[[Values], Any] | None = None
     # A law that is a linear element with memory: parameters and the element's damping -> its branch
     branch: Callable[[Values, float], Maxwell] | None = None
-    # Force along a whole motion (T,), evenly sampled, quicker than step by step; None: as the memory's rate says
+    # Force along a whole evenly sampled motion (T,), faster than stepping; None: by the rate of the memory
     path: Callable[[Motion, Values], FloatArray] | None = None
     restarts: Callable[[FittedElement], tuple[Restart, ...]] | None = None  # besides the start that screening finds
     # Other parameters that look alike on the whole, and from which a fit that leaves much starts once more
@@ -225,7 +225,7 @@ class ElementLaw(Parametrised):
 
     @property
     def of_formula(self) -> bool:
-        """Whether only the text of its force tells what it is."""
+        """Whether it is defined by its formula only."""
         return not self.listed and bool(self.formula)
 
     def clip(self, p: Sequence[float]) -> FloatArray:
@@ -254,7 +254,7 @@ def grid(*columns: Sequence[float] | FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class BodyLaw(Parametrised):
-    """Physics of a body: it changes the mechanics, or loads a degree of freedom by a force nobody measured."""
+    """Physics of a body: it changes the mechanics, or applies an unmeasured force to a degree of freedom."""
 
     name: str
     title: str
@@ -360,20 +360,20 @@ def _as_large_as_found(step: float, amplitude: float) -> float:
 
 
 class DataSheet(NamedTuple):
-    """What an instrument in order may be off by: standard deviations; and what it shows."""
+    """Tolerances of an intact instrument, as standard deviations, and the size of its signal."""
 
     gain: float  # relative
     zero: float  # in the channel's unit
     delay: float  # s
-    size: float  # standard deviation of what it shows, in the channel's unit
+    size: float  # standard deviation of its signal, in the channel's unit
     step: float  # s, from sample to sample
 
 
 @dataclass(frozen=True)
 class SensorLaw(Parametrised):
-    """A fault of a measurement: what it shows instead of the truth.
+    """A fault of a measurement: the shown signal as a function of the true one.
 
-    The response is the law; what a series shows, its inverse and a candidate's sensitivity follow from it.
+    The response defines the law; distortion, correction and sensitivities follow from it.
     """
 
     name: str
@@ -401,7 +401,7 @@ class SensorLaw(Parametrised):
         return truth if self.response is None else passed(truth, self.response(p), sample_rate)
 
     def restore(self, shown: FloatArray, p: Values, sample_rate: float) -> FloatArray:
-        """The truth of what is shown (..., T).  Errors: `ValueError` where nothing of it is left."""
+        """The true signal of a shown one (..., T).  Errors: `ValueError` if it cannot be restored."""
         if self.stuck:
             raise ValueError(f"{self.name}: nothing is left of the signal")
         return shown if self.response is None else undone(shown, self.response(p), sample_rate)

@@ -1,4 +1,4 @@
-"""Physics of a body: an elastic mode, a force nobody measured, another mass."""
+"""Physics of a body: an elastic mode, an unmeasured force, another mass."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ EXTERNAL_FORCE = BodyLaw(
     absent=(0.0, 1.0, 0.0),
     looks_like="a line as narrow as the recording is long, without relation to the inputs",
     confused_with=("flexible_mode", "wheel_flat", "rail_joints"),
-    sentence="a force of {amplitude} at {frequency} that nobody measured acts on the body",
+    sentence="an unmeasured force of {amplitude} at {frequency} acts on the body",
 )
 
 

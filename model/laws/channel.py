@@ -27,7 +27,7 @@ def passed(truth: FloatArray, response: SensorResponse, sample_rate: float) -> F
 
 
 def undone(shown: FloatArray, response: SensorResponse, sample_rate: float) -> FloatArray:
-    """The truth of what a channel shows (..., T); a lag's inverse raises noise as a derivative does."""
+    """The true signal of a shown one (..., T); the inverse of a lag amplifies noise like a derivative."""
     late = (shown - response.offset) / response.gain
     return _filtered(late, sample_rate, response.lag, response.delay, -1) if response.lag or response.delay else late
 

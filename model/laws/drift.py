@@ -16,10 +16,10 @@ from sprung.model.laws.base import (
 )
 from sprung.model.signals import FloatArray
 
-_CHANGE = ParameterSpec(  # more than twice what it was is rather a value that the file holds wrong
+_CHANGE = ParameterSpec(  # a larger change is rather a wrong value of the file
     "p", "1", -0.95, 20.0, "relative change that is reached in the end", lambda seen: 0.1, usual=(0.0, 10.0)
 )
-_TAU = ParameterSpec(  # what is done before the first sample does not change during the recording
+_TAU = ParameterSpec(  # a change completed before the first sample is not observable
     "tau",
     "s",
     0.05,

@@ -24,7 +24,7 @@ import numpy as np
 
 _LONGEST = 1000  # characters of a formula
 _MOST_INTEGER = 2**53  # beyond it integers are no doubles; larger numbers are written as 1e20
-MOTION = ("d", "v", "t", "z", "k", "c")  # what a formula may name besides the law's parameters
+MOTION = ("d", "v", "t", "z", "k", "c")  # variables of a formula beside the law's parameters
 
 
 class FormulaError(ValueError):

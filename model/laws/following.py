@@ -26,7 +26,7 @@ class Covariate:
 
     @staticmethod
     def of(name: str, unit: str, series: FloatArray, sample_rate: float) -> Covariate | None:
-        """A recorded column (T,), its gaps closed; None: it says nothing, being constant or absent."""
+        """A recorded column (T,), its gaps closed; None if it is constant or absent."""
         good = np.isfinite(series)
         if not good.any() or np.ptp(series[good]) == 0:
             return None

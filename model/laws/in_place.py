@@ -1,4 +1,4 @@
-"""Laws of bodies and of the structure in the mechanics that they change, and what of it follows their values."""
+"""Laws of bodies and structure applied to the mechanics, and derivatives by their values."""
 
 from __future__ import annotations
 

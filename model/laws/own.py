@@ -9,7 +9,7 @@ from sprung.model.laws.base import Law
 
 
 class LawFileError(ValueError):
-    """The file of laws cannot be used; the message says why in one line."""
+    """The file of laws cannot be used; the message gives the reason in one line."""
 
 
 def load_laws(path: str | Path, known: tuple[str, ...] = ()) -> tuple[Law, ...]:

@@ -39,7 +39,7 @@ class PlacedLaw:
 
 
 def placed_laws(file: SystemFile, catalogue: Sequence[Law] = CATALOGUE) -> tuple[tuple[PlacedLaw, ...], list[str]]:
-    """The laws of a system file in its order, and what is wrong with them, each as `key: what is wrong`."""
+    """The laws of a system file in its order, and errors, each as `key: error`."""
     found: list[PlacedLaw] = []
     problems: list[str] = []
     for key, location, settings, kinds in _places(file):

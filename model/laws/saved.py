@@ -16,7 +16,7 @@ from sprung.model.laws.formula import formula_law
 from sprung.model.laws.grammar import DECAYS, filtered
 from sprung.model.signals import FloatArray
 
-_TRIED = (0.5, 1.0, 2.0)  # times a saved value, of what a force is not linear in
+_TRIED = (0.5, 1.0, 2.0)  # factors on saved values of nonlinear parameters
 _FACTOR = 100.0  # either way, that such a value may be otherwise
 _UNIT = SpringDamper(1.0, 1.0)
 

@@ -39,7 +39,7 @@ _LATE = SensorLaw(
     response=lambda p: SensorResponse(delay=p[0]),
     at=("sensor", "support"),
     scale=_tenth_of_a_sample,
-    of_instrument=lambda sheet: min(sheet.delay, sheet.step),  # whoever samples fast keeps better time
+    of_instrument=lambda sheet: min(sheet.delay, sheet.step),  # fast instruments have better clocks
 )
 # Filters in the measuring chain are late by another law; at the frequencies that a suspension passes on alike at first
 _FIRST_ORDER = replace(

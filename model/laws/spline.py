@@ -235,7 +235,7 @@ class _Evidence:
     ) -> None:
         self.gram, self.product, self.power, self.count = gram, product, power, count
         self.along_d, self.along_v = surface.roughness
-        # Size of the force, N: what is explained over what a force of 1 N rms would show
+        # size of the force, N: explained signal over that of a force of 1 N rms
         gain = float(np.trace(gram)) / max(force_power, 1e-300)
         self.size = max(float(np.sqrt(self._explained()[0] / max(gain, 1e-300))), 1e-12)
 

@@ -1,4 +1,4 @@
-"""Faults of measurements that a system file knows of, taken out of what was recorded."""
+"""Correction of recorded signals for known faults of measurements in the system file."""
 
 from __future__ import annotations
 

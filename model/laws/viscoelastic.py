@@ -124,7 +124,7 @@ _LOSSY_APART = 4.0
 _LOSSY_FOLLOWED = 0.01  # of a loss factor that seven branches read from dense ones, over half a decade or two
 _POWER_FOLLOWED = 0.2  # of 0.1, the same of the power
 _LOSSY = _UNIT * 1.75 * _LOSSY_APART ** np.arange(-3.0, 4.0)  # 1/s, poles
-_AT_1_HZ = _UNIT**2 + _LOSSY**2  # what the branches' answers there are divided by
+_AT_1_HZ = _UNIT**2 + _LOSSY**2  # normalises the response of the branches there
 
 
 def _unchanged(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:

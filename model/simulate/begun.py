@@ -15,11 +15,11 @@ _ROUNDS = 3  # slopes in a stretch, at most
 _STEPS = 4  # with the same slopes, at most
 _DIFFERENCE = 1e-3  # of the rms motion, for slopes
 _GAINED = 0.01  # of the squares of the error: less is the end of a stretch
-_HELD = 1e-4  # of the largest square of slopes: what a short stretch does not tell stays where it is
+_HELD = 1e-4  # relative regularisation: states that a short stretch does not determine are kept
 
 
 def fitted_start(system: System, inputs: FloatArray, measured: FloatArray) -> FloatArray:
-    """The state at the first sample with which a ride comes nearest to what the sensors show, shape (N,).
+    """The initial state (N,) with which a simulation comes nearest to the sensors.
 
     inputs: (T, I); measured: (T, S), NaN where missing.  Weighted least squares over the linear system's free motion.
     Where laws act along elements, Gauss-Newton with the laws follows over a first stretch, then over longer ones: a

@@ -24,7 +24,7 @@ class Drive:
 
     @property
     def integrated(self) -> int:
-        """How often what is measured has to be integrated."""
+        """Number of integrations from the measured quantity to displacement."""
         return used(self.noise)[0] if self.noise else 0
 
     def noise_at(self, omega: FloatArray, dt: float) -> FloatArray:

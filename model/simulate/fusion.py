@@ -1,4 +1,4 @@
-"""One smooth motion from what is measured of a point: its displacement, velocity, acceleration, or several of them.
+"""Fusion of measured displacement, velocity and acceleration of a point into one smooth motion.
 
 All samples carry noise, and one signal is the derivative of the other: the least-squares quintic spline with a knot at
 every sample, fitted to all of them with their noises as weights, uses the displacement at low and the acceleration at
@@ -33,7 +33,7 @@ Noises = Mapping[int, float]  # standard deviation of one sample, by the derivat
 
 
 def used(noise: Noises) -> tuple[int, ...]:
-    """Which of the measured derivatives tell the motion: all that carry noise, or only those that are exact."""
+    """The measured derivatives used for the motion: all that carry noise, or only the exact ones."""
     exact = tuple(order for order, std in sorted(noise.items()) if std <= 0)
     return exact or tuple(sorted(noise))
 
@@ -97,7 +97,7 @@ def _leaving(T: int, dt: float, key: tuple[tuple[int, float], ...]) -> FloatArra
 
 
 def _precision(omega: FloatArray, dt: float, noise: Noises) -> FloatArray:
-    """What every used derivative tells of the displacement, (orders, F)."""
+    """Information of every used derivative on the displacement, (orders, F)."""
     orders = used(noise)
     lowest = orders[0]  # what is integrated is so exactly; the spline differentiates
     factors = [omega**lowest * _derivative(omega, dt, order - lowest) for order in orders]

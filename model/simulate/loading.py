@@ -42,7 +42,7 @@ SIDE_STD = 0.03  # of s: a load of 15 % of the car that sits 30 cm off its middl
 REACHING: dict[Kind, str] = {"reach_x": "pitch", "reach_y": "roll"}  # the angle that accelerometers show through it
 OWN_STD: dict[
     Kind, float
-] = {  # of what a file does not know of a body: drawings and weighed prototypes agree to some per cent
+] = {  # of deviations of bodies from the file: drawings and weighed prototypes agree to some per cent
     "own_roll": 0.03,
     "own_pitch": 0.03,
     "reach_x": 0.015,

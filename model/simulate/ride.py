@@ -26,7 +26,7 @@ class SimulationError(ValueError):
 class Ride:
     """One simulated recording."""
 
-    sensors: FloatArray  # what the sensors show, with their faults and noise where asked for, shape (T, S)
+    sensors: FloatArray  # sensor signals, with faults and noise if requested, shape (T, S)
     states: FloatArray  # displacements, then rates, shape (T, N)
     deflection: FloatArray  # of every element, m, shape (T, E)
     rate: FloatArray  # m/s, shape (T, E)

@@ -18,7 +18,7 @@ from sprung.model.simulate.etd import ForceSteps, March, Site, march
 
 _WIDTH = 384  # runs that march together: enough to hide the interpreter, few enough for the cache
 _SHORTEST = 50  # samples of a segment
-_RUNAWAY = 1e3  # growth of the states from the first sweep that tells divergence
+_RUNAWAY = 1e3  # growth of the states since the first sweep at divergence
 _PATIENCE, _SHRINKS = 8, 0.5  # sweeps in which the change of the first states has to fall, and to which share
 _FEW = 8  # segments that are not worth their sweeps where more of them have not settled
 

@@ -130,4 +130,4 @@ def test_the_command_ranks_the_runs_of_a_menu(tmp_path: Path, capsys: pytest.Cap
     assert main(["experiment", str(tmp_path / "report.json"), "--menu", str(tmp_path / "menu.yaml")]) == 0
     assert "strut: bump_stop" in capsys.readouterr().out
     assert main(["experiment", files[0]]) == 2
-    assert "one model" in capsys.readouterr().err
+    assert "a single model" in capsys.readouterr().err
