@@ -213,8 +213,8 @@ def test_a_replay_that_is_slower_than_asked_says_so() -> None:
 def test_what_a_recording_lost_is_counted_in_words() -> None:
     fed = Fed("a", Counter(used=8, repaired=1, dropped=1), Counter({"gap in x": 1}), late=2)
     assert incomplete_line(Path("a.mcap"), fed) == (
-        "a.mcap: not monitored: 1 window repaired, 1 window dropped (gap in x: 1), 2 windows not tracked: older than what "
-        "was known of a; 10 windows in all"
+        "a.mcap: not monitored: 1 window repaired, 1 window dropped (gap in x: 1), 2 windows not tracked: older than "
+        "what was known of a; 10 windows in all"
     )
 
 
