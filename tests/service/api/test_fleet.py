@@ -222,7 +222,7 @@ def test_unknown_query_parameters_are_refused(client: TestClient, core: Core, sy
     feed(core, system, "a", 1)
     answer = client.get(path)
     assert answer.status_code == 422
-    assert "no query parameter" in answer.json()["detail"]
+    assert "not a query parameter" in answer.json()["detail"]
 
 
 def test_several_parameters_at_once_and_as_columns(client: TestClient, core: Core, system: System) -> None:
