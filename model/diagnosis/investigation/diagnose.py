@@ -19,7 +19,7 @@ from sprung.model.diagnosis.investigation.named_laws import with_named_laws
 from sprung.model.diagnosis.investigation.next_finding import next_finding
 from sprung.model.diagnosis.investigation.redundant import without_redundant
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
-from sprung.model.diagnosis.investigation.significance import shared_gain_covariance, without_insignificant
+from sprung.model.diagnosis.investigation.significance import shared_gain_covariance, without_insignificant, without_refuted
 from sprung.model.diagnosis.investigation.state import (
     InputFault,
     Investigation,
@@ -89,6 +89,9 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     state = without_insignificant(state)
     progress(0.93, "the model on the whole recording")
     final = _on_whole_recording(state)
+    fewer = without_refuted(state, final)
+    if fewer is not None:
+        return concluded(fewer, tell)
     final = replace(final, covariance=final.covariance + form_covariance(state) + shared_gain_covariance(state))
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)

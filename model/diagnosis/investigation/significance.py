@@ -46,6 +46,16 @@ def without_insignificant(state: Investigation) -> Investigation:
     return state
 
 
+def without_refuted(state: Investigation, final: Fit) -> Investigation | None:
+    """The investigation without a finding that is absent from the fit to the whole recording; None if all are there."""
+    rules = state.options.rules.plausible
+    for index in reversed(range(len(state.found))):
+        at = state.given + index
+        if not within_tolerance(state, final.point.terms[at]) and hardly_there(final, rules, at):
+            return without(state, index)
+    return None
+
+
 def shared_gain_covariance(state: Investigation) -> FloatArray:
     """Covariance of parameters and laws from the uncertainty of the gain common to all channels, (P + p, P + p)."""
     fit, (_, spread) = state.fit, shared_gain(_instruments(state))

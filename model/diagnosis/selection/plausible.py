@@ -95,10 +95,12 @@ def hardly_there(fit: Fit, rules: PlausibleRules = RULES.plausible, index: int =
     Of other terms: never.
     """
     term = fit.point.terms[index]
-    if len(term.parameters) != 1 or not np.isfinite(term.law.absent[0]):
+    if len(term.parameters) != 1:
         return False
     value, at = term.parameters[0], fit.place(index).start
     stated = np.hypot(np.sqrt(max(fit.covariance[at, at], 0.0)), rules.simulated * abs(value))
+    if not np.isfinite(term.law.absent[0]):  # the inverse vanishes: a rigid connection has no compliance
+        return bool(abs(value) < rules.apart * stated)
     return bool(abs(value - term.law.absent[0]) < rules.apart * stated)
 
 

@@ -99,6 +99,8 @@ def test_gains_and_masses_that_stand_for_something_else_are_not_believed(
         ("sensor_gain", (1.008,), 1e-5, False),
         ("mass_change", (1.02,), 0.01, True),
         ("sensor_bias", (0.02,), 0.001, False),
+        ("series_stiffness", (1e12,), 5e14, True),  # as good as rigid
+        ("series_stiffness", (1e7,), 1e6, False),
         ("coulomb_friction", (20.0, 0.01), 30.0, False),  # several values at once: what they explain tells
     ],
 )
