@@ -19,7 +19,11 @@ from sprung.model.diagnosis.investigation.named_laws import with_named_laws
 from sprung.model.diagnosis.investigation.next_finding import next_finding
 from sprung.model.diagnosis.investigation.redundant import without_redundant
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
-from sprung.model.diagnosis.investigation.significance import shared_gain_covariance, without_insignificant, without_refuted
+from sprung.model.diagnosis.investigation.significance import (
+    shared_gain_covariance,
+    without_insignificant,
+    without_refuted,
+)
 from sprung.model.diagnosis.investigation.state import (
     InputFault,
     Investigation,

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from sprung.model.diagnosis.record.fused import FusedMotion
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.schema import Element, MotionSensor
+from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 Undo = Callable[[System, Signals], tuple[System, Signals]]
@@ -17,30 +20,19 @@ _EDGE = 5  # samples beside a cut that a shift between samples spoils
 
 def turn(sensors: Sequence[int] = (), supports: Sequence[int] = (), forces: Sequence[int] = ()) -> Undo:
     """The other sign."""
-    return scale(sensors, supports, supports, -1.0, forces)
+    return scale(sensors, supports, -1.0, forces)
 
 
-def scale(
-    sensors: Sequence[int],
-    displacements: Sequence[int],
-    velocities: Sequence[int],
-    ratio: float,
-    forces: Sequence[int] = (),
-) -> Undo:
+def scale(sensors: Sequence[int], supports: Sequence[int], ratio: float, forces: Sequence[int] = ()) -> Undo:
     """Divided by what they were too large by."""
 
     def undo(system: System, signals: Signals) -> tuple[System, Signals]:
-        copies = {}
-        for key, at in (
-            ("sensors", sensors),
-            ("displacement", displacements),
-            ("velocity", velocities),
-            ("force", forces),
-        ):
+        copies: dict[str, Any] = {}
+        for key, at in (("sensors", sensors), ("displacement", supports), ("velocity", supports), ("force", forces)):
             series = getattr(signals, key).copy()
             series[:, list(at)] /= ratio
             copies[key] = series
-        return system, replace(signals, **copies)
+        return system, replace(signals, **copies, fused=_changed(signals, supports, lambda series: series / ratio))
 
     return undo
 
@@ -49,13 +41,15 @@ def exchange(sensors: Sequence[tuple[int, int]] = (), supports: Sequence[tuple[i
     """Pairs of channels in each other's place."""
 
     def undo(system: System, signals: Signals) -> tuple[System, Signals]:
-        copies = {}
+        copies: dict[str, Any] = {}
         for key, pairs in (("sensors", sensors), ("displacement", supports), ("velocity", supports)):
             series = getattr(signals, key).copy()
             for i, j in pairs:
                 series[:, [i, j]] = series[:, [j, i]]
             copies[key] = series
-        return system, replace(signals, **copies)
+        there = dict(supports) | {j: i for i, j in supports}
+        fused = tuple(replace(one, support=there.get(one.support, one.support)) for one in signals.fused)
+        return system, replace(signals, **copies, fused=fused)
 
     return undo
 
@@ -66,7 +60,14 @@ def advance(sensors: Sequence[int], supports: Sequence[int], late: float, forces
     def undo(system: System, signals: Signals) -> tuple[System, Signals]:
         rate, samples = signals.sample_rate, signals.samples
         time, omega = np.arange(samples) / rate, 2 * np.pi * np.fft.rfftfreq(samples, 1 / rate)
-        copies = {}
+
+        def earlier(series: FloatArray) -> FloatArray:
+            """Columns (T, m) by band-limited interpolation, the line through their ends aside."""
+            line = series[:1] + (series[-1:] - series[:1]) * (time / time[-1])[:, None]
+            spectrum = np.fft.rfft(series - line, axis=0) * np.exp(1j * omega * late)[:, None]
+            return np.asarray(np.fft.irfft(spectrum, samples, axis=0) + line)
+
+        copies: dict[str, Any] = {}
         for key, at in (
             ("sensors", sensors),
             ("displacement", supports),
@@ -75,14 +76,20 @@ def advance(sensors: Sequence[int], supports: Sequence[int], late: float, forces
         ):
             series = getattr(signals, key).copy()
             chosen = [i for i in at if np.isfinite(series[0, i])]
-            line = series[:1, chosen] + (series[-1:, chosen] - series[:1, chosen]) * (time / time[-1])[:, None]
-            spectrum = np.fft.rfft(series[:, chosen] - line, axis=0) * np.exp(1j * omega * late)[:, None]
-            series[:, chosen] = np.fft.irfft(spectrum, samples, axis=0) + line
+            series[:, chosen] = earlier(series[:, chosen])
             copies[key] = series
         lost = int(np.ceil(abs(late) * rate)) + _EDGE
-        return system, replace(signals, **copies).part(lost, samples - lost)
+        fused = _changed(signals, supports, lambda series: earlier(series[:, None])[:, 0])
+        return system, replace(signals, **copies, fused=fused).part(lost, samples - lost)
 
     return undo
+
+
+def _changed(
+    signals: Signals, supports: Sequence[int], change: Callable[[FloatArray], FloatArray]
+) -> tuple[FusedMotion, ...]:
+    """The channels of accelerated supports, those of some supports changed."""
+    return tuple(one.changed(change) if one.support in supports else one for one in signals.fused)
 
 
 def _with_part(system: System, kind: str, name: str, part: Element | MotionSensor) -> System:

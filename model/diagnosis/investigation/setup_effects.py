@@ -105,7 +105,7 @@ def _late(site: SetupPlace, fitted: CorrectedFit) -> tuple[ChangeEstimate, float
 
 def _rescaled(site: SetupPlace, ratio: float) -> changes.Undo:
     group = site.group
-    return changes.scale(group.sensors, group.supports, group.supports, ratio, group.forces)
+    return changes.scale(group.sensors, group.supports, ratio, group.forces)
 
 
 def _scaled(site: SetupPlace, fitted: CorrectedFit) -> tuple[ChangeEstimate, float]:

@@ -23,7 +23,7 @@ from sprung.model.diagnosis.investigation.setup_response import Group, ModelResp
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.rules import SetupRules
-from sprung.model.schema import MotionSensor, Sensor
+from sprung.model.schema import MotionSensor, Sensor, SupportInput
 from sprung.model.sensor_kinds import KINDS
 from sprung.model.system import System
 
@@ -66,12 +66,19 @@ class Wiring:
     def name(self, group: Group) -> str:
         """Channels of a group joined by "|"."""
         names = [self.signals.sensor_names[i] for i in group.sensors]
-        for j in group.supports:
-            support = self.signals.support_names[j]
-            for quantity in ("displacement", "velocity"):
-                if f"{support}.{quantity}" in {channel.name for channel in self.system.inputs}:
-                    names.append(f"{support}.{quantity}")
+        for support in (self.signals.support_names[j] for j in group.supports):
+            names += [f"{support}.{quantity}" for quantity in self._measured(support)]
         return "|".join([*names, *(self.signals.force_names[k] for k in group.forces)])
+
+    def _measured(self, support: str) -> tuple[str, ...]:
+        source = self.system.file.inputs[support]
+        return tuple(source.measured) if isinstance(source, SupportInput) else ()
+
+    @property
+    def all_accelerations(self) -> bool:
+        """Whether sensors and supports are measured by nothing but accelerations."""
+        supports = [self._measured(support) for support in self.signals.support_names]
+        return all(kind == "acceleration" for kind in (*self.kind, *(q for measured in supports for q in measured)))
 
     def groups(self) -> list[Group]:
         """Single channels, and what may share a node, a kind or a scale."""
@@ -178,13 +185,12 @@ def _exchanged(
 
 
 def _delays(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
-    """Nodes are late, not early: where a group seems early, the others are late."""
+    """Nodes are late, not early: where a group seems early, the others are late.
+
+    A sensor that is late alone is a fault of that sensor; what is measured of a support is late together.
+    """
     for group in wired.groups():
-        count = len(group.sensors) + len(group.supports)
-        if len(group.sensors) == len(wired.sensors):
-            if wired.signals.support_names:  # the motions are early: attributed to neither
-                continue
-        elif count < 2:
+        if len(group.sensors) == 1 and not group.supports:
             continue
         late = one.delay(group, rules)
         if late > 0:
@@ -200,9 +206,15 @@ def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
         if len(group.supports) == len(wired.signals.support_names) > 1:
             continue  # the same as all sensors the other way
         ratio = one.ratio(group)
+        if wired.all_accelerations and _is_gravity(ratio, rules):
+            continue  # the others are in g: they show less by as much
         if np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale):
             misfit = one.misfit(one.scaled(group, ratio))
             yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, misfit)
+
+
+def _is_gravity(ratio: float, rules: SetupRules) -> bool:
+    return bool(ratio > 0 and abs(np.log(ratio / _STANDARD_GRAVITY)) < rules.gravity)
 
 
 def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -228,7 +240,7 @@ def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Ite
     ratio = inert.ratio(sensors)
     if not (np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale)):
         return
-    group = sensors if abs(abs(np.log(ratio)) - np.log(_STANDARD_GRAVITY)) < rules.gravity else forces
+    group = sensors if _is_gravity(max(ratio, 1 / ratio), rules) else forces
     ratio = ratio if group is sensors else 1 / ratio
     if inert.misfit(inert.scaled(group, ratio)) < rules.by_mass * before:
         misfit = one.misfit(one.scaled(group, ratio))

@@ -7,7 +7,7 @@ of the record has to be continued, which an acceleration that is integrated twic
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,6 +30,10 @@ class FusedMotion:
     def part(self, start: int, stop: int) -> FusedMotion:
         """A stretch of samples."""
         return replace(self, series={order: one[start:stop] for order, one in self.series.items()})
+
+    def changed(self, change: Callable[[FloatArray], FloatArray]) -> FusedMotion:
+        """All channels changed alike."""
+        return replace(self, series={order: change(one) for order, one in self.series.items()})
 
     def displacement(self, dt: float) -> FloatArray:
         """The displacement that fits all of them, (T,), m."""
