@@ -60,6 +60,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "sprung.benchmarks.setups",
         "wrong set-ups on simulated recordings: signs, channels, nodes, scales, positions, bodies",
     ),
+    "setup-rigs": ("sprung.benchmarks.setup_rigs", "wrong set-ups of rigs that are no train"),
     "naming": (
         "sprung.benchmarks.naming",
         "component tests of what rigs do, listed or not: right, unknown, wrong, missed",

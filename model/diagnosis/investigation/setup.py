@@ -140,11 +140,13 @@ def _best(
             except DiagnosisError:
                 continue
             remaining = total_misfit(again)
-            if remaining < rules.explains * total:
+            one = _fault(hypothesis, total, remaining), changed, corrected, other, again
+            if rules.explains * total <= remaining < rules.promising * total and hypothesis is ranked[0]:
+                one = _refined(one, declared, fitted)  # its value was read beside parameters that had absorbed part
+            if one[0].after < rules.explains * total:
                 if hypothesis.by_mass:  # independent of stiffnesses, which absorb part of the others
-                    fault = _fault(hypothesis, total, remaining), changed, corrected, other, again
-                    return _refined(fault, declared, fitted)
-                accepted.append((_fault(hypothesis, total, remaining), changed, corrected, other, again))
+                    return _refined(one, declared, fitted)
+                accepted.append(one)
         accepted.sort(key=_after)
         rivals = _rivals(accepted, rules.rivals)
         if all(one[0].effect.ordinary for one in rivals):
