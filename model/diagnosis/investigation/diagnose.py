@@ -95,7 +95,7 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     final = _on_whole_recording(state)
     fewer = without_refuted(state, final)
     if fewer is not None:
-        return concluded(fewer, tell)
+        return concluded(fewer, progress)
     final = replace(final, covariance=final.covariance + form_covariance(state) + shared_gain_covariance(state))
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
