@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from sprung.model.diagnosis.record.fused import FusedMotion
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.schema import Element, MotionSensor
 from sprung.model.signals import FloatArray
@@ -27,12 +26,7 @@ def scale(sensors: Sequence[int], supports: Sequence[int], ratio: float, forces:
     """Divided by what they were too large by."""
 
     def undo(system: System, signals: Signals) -> tuple[System, Signals]:
-        copies: dict[str, Any] = {}
-        for key, at in (("sensors", sensors), ("displacement", supports), ("velocity", supports), ("force", forces)):
-            series = getattr(signals, key).copy()
-            series[:, list(at)] /= ratio
-            copies[key] = series
-        return system, replace(signals, **copies, fused=_changed(signals, supports, lambda series: series / ratio))
+        return system, _changed(signals, sensors, supports, forces, lambda columns: columns / ratio)
 
     return undo
 
@@ -67,29 +61,28 @@ def advance(sensors: Sequence[int], supports: Sequence[int], late: float, forces
             spectrum = np.fft.rfft(series - line, axis=0) * np.exp(1j * omega * late)[:, None]
             return np.asarray(np.fft.irfft(spectrum, samples, axis=0) + line)
 
-        copies: dict[str, Any] = {}
-        for key, at in (
-            ("sensors", sensors),
-            ("displacement", supports),
-            ("velocity", supports),
-            ("force", forces),
-        ):
-            series = getattr(signals, key).copy()
-            chosen = [i for i in at if np.isfinite(series[0, i])]
-            series[:, chosen] = earlier(series[:, chosen])
-            copies[key] = series
         lost = int(np.ceil(abs(late) * rate)) + _EDGE
-        fused = _changed(signals, supports, lambda series: earlier(series[:, None])[:, 0])
-        return system, replace(signals, **copies, fused=fused).part(lost, samples - lost)
+        return system, _changed(signals, sensors, supports, forces, earlier).part(lost, samples - lost)
 
     return undo
 
 
 def _changed(
-    signals: Signals, supports: Sequence[int], change: Callable[[FloatArray], FloatArray]
-) -> tuple[FusedMotion, ...]:
-    """The channels of accelerated supports, those of some supports changed."""
-    return tuple(one.changed(change) if one.support in supports else one for one in signals.fused)
+    signals: Signals,
+    sensors: Sequence[int],
+    supports: Sequence[int],
+    forces: Sequence[int],
+    change: Callable[[FloatArray], FloatArray],
+) -> Signals:
+    """Signals with everything that is measured at some places changed alike, as columns (T, m)."""
+    copies: dict[str, Any] = {}
+    for key, at in (("sensors", sensors), ("displacement", supports), ("velocity", supports), ("force", forces)):
+        series = getattr(signals, key).copy()
+        measured = [i for i in at if np.isfinite(series[0, i])]
+        series[:, measured] = change(series[:, measured])
+        copies[key] = series
+    fused = tuple(one.changed(change) if one.support in supports else one for one in signals.fused)
+    return replace(signals, **copies, fused=fused)
 
 
 def _with_part(system: System, kind: str, name: str, part: Element | MotionSensor) -> System:

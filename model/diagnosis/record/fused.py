@@ -32,8 +32,8 @@ class FusedMotion:
         return replace(self, series={order: one[start:stop] for order, one in self.series.items()})
 
     def changed(self, change: Callable[[FloatArray], FloatArray]) -> FusedMotion:
-        """All channels changed alike."""
-        return replace(self, series={order: change(one) for order, one in self.series.items()})
+        """All channels changed alike, as columns (T, 1)."""
+        return replace(self, series={order: change(one[:, None])[:, 0] for order, one in self.series.items()})
 
     def displacement(self, dt: float) -> FloatArray:
         """The displacement that fits all of them, (T,), m."""
