@@ -1,7 +1,8 @@
 """`sprung bench paper-cells`: random figures of docs/paper.md made again from nothing, and held against what it states.
 
-Only tables that say which seeds they were made from are drawn from.  A figure of one seed must come out again to the
-four digits that are printed; one of several seeds within three of its standard deviations, from the first seed.
+Only tables that say which seeds they were made from, below them or line by line, are drawn from.  A figure of one seed
+must come out again to the four digits that are printed; one of several seeds within three of its standard deviations,
+from the first seed.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from sprung.benchmarks import paper
 from sprung.service.errors import UserError
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "paper.md"
-BLOCK = re.compile(r"<!-- rows (\w+) -->(.*?)<!-- end -->", re.DOTALL)
+BLOCK = re.compile(r"<!-- (?:rows|variants) (\w+) -->(.*?)<!-- end -->", re.DOTALL)
 SEEDS = re.compile(r"seeds? ([\d, ]+)")
 CELL = re.compile(r"(-?[\d.]+(?:e[-+]?\d+)?)(?: ± ([\d.]+(?:e[-+]?\d+)?))?")
 DIGITS = 1e-3  # relative: what four printed digits leave open
@@ -73,17 +74,17 @@ def stated(text: str) -> list[StatedCell]:
     """Every figure of the tables of a page that name their seeds."""
     found = []
     for task, block in BLOCK.findall(text):
-        seeds = SEEDS.search(block.rpartition("|")[2])
-        if seeds is None:
-            continue
-        numbers = tuple(int(part) for part in seeds.group(1).replace(",", " ").split())
-        lines = [line.strip("| \n").split(" | ") for line in block.splitlines() if line.startswith("|")]
-        header, rows = lines[0][1:], lines[2:]
-        for name, *cells in rows:
-            for column, cell in zip(header, cells, strict=False):
-                if match := CELL.match(cell):
+        table, _, told = block.strip().partition("\n\n")
+        made = SEEDS.search(told)
+        lines = [[part.strip() for part in line.strip("| ").split("|")] for line in table.splitlines()]
+        for line in lines[2:]:
+            cells = dict(zip(lines[0][1:], line[1:], strict=False))
+            seeds = cells.pop("seeds", made.group(1) if made else "")
+            numbers = tuple(int(part) for part in seeds.replace(",", " ").split())
+            for column, cell in cells.items():
+                if numbers and (match := CELL.match(cell)):
                     spread = None if match.group(2) is None else float(match.group(2))
-                    found.append(StatedCell(task, name, column, float(match.group(1)), spread, numbers))
+                    found.append(StatedCell(task, line[0], column, float(match.group(1)), spread, numbers))
     return found
 
 

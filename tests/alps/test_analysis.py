@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from sprung.benchmarks import paper_report
-from sprung.benchmarks.paper_settings import sources
 from sprung.model.alps import kernels, metrics, pendulum, phase, two_body
 
 
@@ -83,18 +79,3 @@ def test_a_model_in_mirrored_coordinates_is_not_blamed() -> None:
     true = pendulum.TASK.sample(3, np.random.default_rng(0), pendulum.TASK.seen).states
     move = metrics.aligned(pendulum.TASK, -true, true)
     assert metrics.state_error(pendulum.TASK, move(-true), true) == pytest.approx(0, abs=1e-20)
-
-
-def test_the_report_says_which_targets_are_met(tmp_path: Path) -> None:
-    folder = tmp_path / "rows"
-    folder.mkdir()
-    for seed, error in ((0, 0.03), (1, 0.05)):
-        row = {"task": "pendulum", "method": "alps", "SE": 100.0, "PE": error, "commit": "abc", "sources": sources()}
-        (folder / f"pendulum-alps-s{seed}.json").write_text(json.dumps(row))
-    document = tmp_path / "paper.md"
-    document.write_text("<!-- targets -->\n<!-- end -->\n<!-- rows pendulum -->\n<!-- end -->\n")
-    paper_report.main(tmp_path, document)
-    text = document.read_text()
-    assert "| pendulum | alps PE | 0.06 | 0.05 | 0.04 ± 0.014 | yes |" in text
-    assert "| pendulum | alps SE | 86.48 | 86.48 | 100 ± 0 | no |" in text
-    assert "| train | alps SE | 3.02 | - | not run yet |  |" in text

@@ -1,0 +1,112 @@
+"""Marked places of docs/paper.md, and what is written into each.
+
+A place begins with `<!-- KIND TASK -->` or `<!-- targets -->` and ends with `<!-- end -->`.  Places of tasks without
+rows keep what they have.  Pictures go to `img/paper/` beside the document.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed
+from sprung.benchmarks.paper_report.tables import name_of, seeds_of, table
+from sprung.benchmarks.paper_report.targets import targets
+from sprung.benchmarks.paper_settings import EXTRA, sources
+from sprung.service.errors import UserError
+
+PLACE = re.compile(r"<!-- (?P<kind>\w+)(?: (?P<task>\w+))? -->(?P<before>.*?)<!-- end -->", re.DOTALL)
+VARIANTS = ("alps", *EXTRA)  # beside ALPS: as printed, a departure left out, newer methods
+Rows = list[dict[str, Any]]
+
+
+def run(data: Path | None = None, document: Path | None = None, *, only: str | None = None) -> Iterator[dict[str, Any]]:
+    """One dict per place of the document that was written: its marker, how many rows, their seeds, whether it changed.
+
+    data: folder of the budget, runs/paper/quick by default; document: docs/paper.md by default;
+    only: kinds of places, or single ones ("variants", "variants pendulum"), several between commas; no pictures then.
+    """
+    places = None if only is None else [part.strip() for part in only.split(",")]
+    try:
+        yield from refresh(data or Path("runs/paper/quick"), document or Path("docs/paper.md"), places)
+    except (ValueError, OSError) as error:
+        raise UserError(f"bench paper-report: {error}") from error
+
+
+def read_rows(folder: Path) -> Rows:
+    """Rows that were kept.  Errors: `ValueError` naming those that other code made than what stands here."""
+    found = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob("*.json"))]
+    found = [row for row in found if "unfinished" not in row]
+    stale = sorted({f"{row['task']} {name_of(row)}" for row in found if row.get("sources") != sources()})
+    if stale:
+        raise ValueError(f"{folder}: rows of other code than this: {', '.join(stale)}; run them again or remove them")
+    return found
+
+
+def refresh(folder: Path, document: Path, only: list[str] | None = None) -> list[dict[str, Any]]:
+    """Write the document's places and its pictures, or `only` places of these kinds or markers."""
+    found = read_rows(folder)
+    told: list[dict[str, Any]] = []
+
+    def fill(match: re.Match[str]) -> str:
+        kind, task, before = match["kind"], match["task"], match["before"]
+        marker = kind if task is None else f"{kind} {task}"
+        rows = found if task is None else [row for row in found if row["task"] == task]
+        wanted = only is None or kind in only or marker in only
+        if not wanted or kind not in KINDS or (task is not None and not rows):
+            return match[0]
+        text = KINDS[kind](task or "", rows, folder, before)
+        told.append(
+            {"place": marker, "rows": len(rows), "seeds": seeds_of(rows), "changed": text != before.strip("\n")}
+        )
+        return f"<!-- {marker} -->\n{text}\n<!-- end -->"
+
+    document.write_text(PLACE.sub(fill, document.read_text()))
+    if only is not None:
+        return told
+    images = document.parent / "img" / "paper"
+    images.mkdir(parents=True, exist_ok=True)
+    for picture in (folder / "pictures").glob("*.png"):
+        shutil.copy(picture, images)
+    return told
+
+
+def _rows_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    del folder, before
+    return f"{table(task, rows)}\n\n{_made(rows)}"
+
+
+def _against_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    del rows, before
+    return comparisons(task, folder / "errors")
+
+
+def _targets_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    del task, folder
+    return targets(rows, before)
+
+
+def _variants_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    """Figures of ALPS and its variants, each with its own seeds."""
+    del before
+    rows = [row for row in rows if name_of(row) in VARIANTS]
+    compared = comparisons_by_seed(task, folder / "errors", methods=VARIANTS)
+    return f"{table(task, rows)}\n\n{_made(rows)}\n\n{compared}"
+
+
+KINDS: dict[str, Callable[[str, Rows, Path, str], str]] = {
+    "rows": _rows_place,
+    "against": _against_place,
+    "targets": _targets_place,
+    "variants": _variants_place,
+}
+
+
+def _made(rows: Rows) -> str:
+    commits = ", ".join(sorted({f"`{row['commit']}`" for row in rows}))
+    several = "s" if "," in seeds_of(rows) else ""
+    return f"Made at {commits}, seed{several} {seeds_of(rows)}."

@@ -1,0 +1,114 @@
+"""Rows of the paper's benchmark in the document: tables, seeds, comparisons, targets."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sprung.benchmarks import paper_report, rerun_paper
+from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed
+from sprung.benchmarks.paper_settings import sources
+from sprung.service.errors import UserError
+
+PAGE = """# Page
+<!-- targets -->
+<!-- end -->
+<!-- rows pendulum -->
+<!-- end -->
+<!-- variants pendulum -->
+<!-- end -->
+<!-- rows train -->
+as it was
+<!-- end -->
+"""
+
+
+def keep(folder: Path, method: str, seed: int, **figures: Any) -> None:
+    (folder / "rows").mkdir(exist_ok=True)
+    row = {"task": "pendulum", "method": method, "seed": seed, "commit": "abc", "sources": sources()} | figures
+    (folder / "rows" / f"pendulum-{method}-s{seed}.json").write_text(json.dumps(row))
+
+
+def keep_errors(folder: Path, method: str, seed: int, **figures: np.ndarray) -> None:
+    (folder / "errors").mkdir(exist_ok=True)
+    np.savez(folder / "errors" / f"pendulum-{method}-s{seed}.npz", **figures)  # type: ignore[arg-type]
+
+
+def lines(table: str) -> dict[str, list[str]]:
+    """Cells of a table by method and figure, or by method alone."""
+    split = [[cell.strip() for cell in line.strip("| ").split("|")] for line in table.splitlines()[2:]]
+    return {cells[0] + (f" {cells[1]}" if cells[1] in ("SE", "PE") else ""): cells for cells in split}
+
+
+def test_targets_that_are_met_are_said(tmp_path: Path) -> None:
+    for seed, error in ((0, 0.03), (1, 0.05)):
+        keep(tmp_path, "alps", seed, SE=100.0, PE=error)
+    document = tmp_path / "paper.md"
+    document.write_text(PAGE)
+    paper_report.refresh(tmp_path, document)
+    text = document.read_text()
+    assert "| pendulum | alps PE | 0.06 | 0.05 | 0.04 ± 0.014 | yes |" in text
+    assert "| pendulum | alps SE | 86.48 | 86.48 | 100 ± 0 | no |" in text
+    assert "| train | alps SE | 3.02 | - | not run yet |  |" in text
+    assert "<!-- rows train -->\nas it was\n<!-- end -->" in text
+
+
+def test_methods_of_other_seeds_say_theirs_and_are_read_again_with_them(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        keep(tmp_path, "alps", seed, SE=10.0 + seed, PE=0.1)
+    keep(tmp_path, "no_phases", 1, SE=80.0)
+    document = tmp_path / "paper.md"
+    document.write_text(PAGE)
+    paper_report.refresh(tmp_path, document)
+    found = {(cell.method, cell.column): cell for cell in rerun_paper.stated(document.read_text())}
+    assert (found["alps", "SE"].mean, found["alps", "SE"].seeds) == (11.5, (1, 2))
+    assert (found["no_phases", "SE"].spread, found["no_phases", "SE"].seeds) == (None, (1,))
+
+
+def test_only_the_places_that_are_named_are_written(tmp_path: Path) -> None:
+    keep(tmp_path, "alps", 0, SE=1.0, PE=1.0)
+    document = tmp_path / "paper.md"
+    document.write_text(PAGE)
+    (told,) = paper_report.run(tmp_path, document, only="variants pendulum")
+    assert told == {"place": "variants pendulum", "rows": 1, "seeds": "0", "changed": True}
+    assert "<!-- rows pendulum -->\n<!-- end -->" in document.read_text()
+
+
+def test_rows_of_other_code_are_refused(tmp_path: Path) -> None:
+    keep(tmp_path, "alps", 0, sources="other")
+    document = tmp_path / "paper.md"
+    document.write_text(PAGE)
+    with pytest.raises(UserError, match="rows of other code than this: pendulum alps"):
+        list(paper_report.run(tmp_path, document))
+
+
+def test_a_method_that_is_worse_on_every_seed_is_told_from_one_that_is_worse_on_one(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for seed in range(3):
+        base = rng.uniform(1, 2, 60)
+        keep_errors(tmp_path, "alps", seed, SE=base, PE=base)
+        keep_errors(tmp_path, "no_phases", seed, SE=(2 + 0.01 * seed) * base * rng.uniform(0.99, 1.01, 60))
+        keep_errors(tmp_path, "no_opening", seed, SE=(4.0 if seed == 0 else 1.01) * base * rng.uniform(0.99, 1.01, 60))
+    both = lines(comparisons_by_seed("pendulum", tmp_path / "errors"))
+    assert [float(x) for x in both["no_phases SE"][3].split(", ")] == pytest.approx([2, 2.01, 2.02], rel=0.01)
+    by_trajectory, by_seed = (float(cell) for cell in both["no_phases SE"][4:])
+    assert by_trajectory < 1e-20 and by_seed < 0.001
+    by_trajectory, by_seed = (float(cell) for cell in both["no_opening SE"][4:])
+    assert by_trajectory < 1e-20 and by_seed > 0.2  # the networks differ; that the methods do is not shown
+    assert "no_phases PE" not in both  # it has no parameters
+
+
+def test_the_smallest_p_is_corrected_for_the_number_of_methods(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    base = rng.uniform(1, 2, 40)
+    keep_errors(tmp_path, "alps", 0, SE=base)
+    keep_errors(tmp_path, "no_phases", 0, SE=base + 0.1 * rng.standard_normal(40) + 0.05)
+    alone = float(lines(comparisons("pendulum", tmp_path / "errors"))["no_phases"][3])
+    keep_errors(tmp_path, "no_opening", 0, SE=base)
+    beside = lines(comparisons("pendulum", tmp_path / "errors"))
+    assert float(beside["no_phases"][3]) == pytest.approx(2 * alone, rel=0.02)
+    assert beside["no_opening"][2:4] == ["1 (1 to 1)", "1"]
