@@ -1,8 +1,9 @@
 """`sprung bench paper [TASK]`: every table row and figure of the paper, from nothing, beside the paper's values.
 
-Tasks: the three visual systems, the train with constant and with changing parameters, the kernels of Fig. 3, the
-experiments on phases and on features.  Checkpoints lie under `--out` (`runs/paper`, not kept in the repository): a
-command that was stopped, or that ran out of `--minutes`, goes on where it was when it is given again.
+Tasks: the three visual systems, the train with constant, changing and drifting parameters, the kernels of Fig. 3, the
+experiments on phases and on features, and what a window tells.  Checkpoints lie under `--out` (`runs/paper`, not kept
+in the repository): a command that was stopped, or that ran out of `--minutes`, goes on where it was when it is given
+again.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any, cast, get_args
 
 import torch
 
-from sprung.benchmarks import drifting, paper_analysis, paper_settings, paper_train, paper_visual
+from sprung.benchmarks import drifting, paper_analysis, paper_settings, paper_train, paper_visual, window_information
 from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps.config import Budget
 from sprung.model.alps.fit import OutOfTime
@@ -34,6 +35,7 @@ TASKS: dict[str, tuple[Callable[[PaperSettings], Iterator[dict[str, Any]]], tupl
     "kernels": (paper_analysis.kernel_rows, ()),
     "phase": (paper_analysis.phase_rows, ()),
     "features": (paper_analysis.feature_rows, ()),
+    "window_information": (window_information.rows, ()),
 }
 
 

@@ -31,6 +31,9 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "features": (
         "PE_training_magnitudes", "PE_magnitudes", "PE_unseen_magnitudes", "PE_training_raw", "PE_raw", "PE_unseen_raw",
     ),
+    "window_information": (
+        "PE_states", "PE_magnitudes", "PE_states_inputs_known", "PE_magnitudes_inputs_known", "PE_guess",
+    ),
 }  # fmt: skip
 
 
