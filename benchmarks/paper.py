@@ -18,7 +18,15 @@ from typing import Any, cast, get_args
 
 import torch
 
-from sprung.benchmarks import drifting, paper_analysis, paper_settings, paper_train, paper_visual, window_information
+from sprung.benchmarks import (
+    drifting,
+    paper_analysis,
+    paper_settings,
+    paper_train,
+    paper_visual,
+    phase_information,
+    window_information,
+)
 from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps.config import Budget
 from sprung.model.alps.fit import OutOfTime
@@ -34,6 +42,7 @@ TASKS: dict[str, tuple[Callable[[PaperSettings], Iterator[dict[str, Any]]], tupl
     "train_drifting": (drifting.rows, drifting.METHODS),
     "kernels": (paper_analysis.kernel_rows, ()),
     "phase": (paper_analysis.phase_rows, ()),
+    "phase_information": (phase_information.rows, ()),
     "features": (paper_analysis.feature_rows, ()),
     "window_information": (window_information.rows, ()),
 }

@@ -28,6 +28,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "row_minimum",
     ),
     "phase": ("magnitude", "phase", "balance", "guess"),
+    "phase_information": ("magnitudes", "spectra", "guess"),
     "features": (
         "PE_training_magnitudes", "PE_magnitudes", "PE_unseen_magnitudes", "PE_training_raw", "PE_raw", "PE_unseen_raw",
     ),
