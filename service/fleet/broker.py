@@ -26,6 +26,10 @@ Verdict = Literal["stored", "refused", "again"]
 AGAIN_SECONDS = 2.0  # before a message is delivered again that could not be stored
 
 
+class NotAcknowledged(Exception):
+    """The broker was not told what became of a message: it delivers the message again, which changes nothing."""
+
+
 class BrokerMessage(Protocol):
     """A message that was delivered and not yet acknowledged."""
 
@@ -34,10 +38,10 @@ class BrokerMessage(Protocol):
         """As it was sent."""
 
     async def done(self) -> None:
-        """It is stored, or never will be: do not deliver it again."""
+        """It is stored, or never will be: do not deliver it again.  Raises NotAcknowledged."""
 
     async def again(self) -> None:
-        """Deliver it again, later."""
+        """Deliver it again, later.  Raises NotAcknowledged."""
 
 
 class Broker(Protocol):
@@ -74,18 +78,28 @@ async def consume(
         if not deliveries:
             continue
         messages: list[Message | None] = [_readable(one) for one in deliveries]
-        verdicts = iter(await _store([one for one in messages if one is not None], ingest))
-        for delivery, message in zip(deliveries, messages, strict=True):  # in order: Kafka's offsets only go on
-            verdict = "refused" if message is None else next(verdicts)
-            if verdict == "again":
-                counts.again += 1
-                await delivery.again()
-                continue
-            await delivery.done()
-            counts.refused += verdict == "refused"
-            if message is not None and verdict == "stored":
-                counts.messages += 1
-                counts.windows += len(message.windows)
+        stored = iter(await _store([one for one in messages if one is not None], ingest))
+        verdicts: list[Verdict] = ["refused" if message is None else next(stored) for message in messages]
+        for message, verdict in zip(messages, verdicts, strict=True):
+            _count(counts, message, verdict)
+        try:
+            await _acknowledge(deliveries, verdicts)
+        except NotAcknowledged as error:  # one wait is enough: the broker delivers the rest again, too
+            log.warning("the broker does not take acknowledgements (%s); it delivers some messages again", error)
+
+
+def _count(counts: ConsumerCounts, message: Message | None, verdict: Verdict) -> None:
+    counts.again += verdict == "again"
+    counts.refused += verdict == "refused"
+    if message is not None and verdict == "stored":
+        counts.messages += 1
+        counts.windows += len(message.windows)
+
+
+async def _acknowledge(deliveries: Sequence[BrokerMessage], verdicts: Sequence[Verdict]) -> None:
+    """Tell the broker, in order: Kafka's offsets only go on."""
+    for delivery, verdict in zip(deliveries, verdicts, strict=True):
+        await (delivery.again() if verdict == "again" else delivery.done())
 
 
 def _readable(delivery: BrokerMessage) -> Message | None:

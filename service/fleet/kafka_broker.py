@@ -7,16 +7,17 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from sprung.service.errors import UserError
-from sprung.service.fleet.broker import BrokerMessage
+from sprung.service.fleet.broker import BrokerMessage, NotAcknowledged
 
 
 class KafkaBroker:
     """A consumer group.  Offsets are committed up to what is done, partition by partition, never beyond a record that
     is to come again."""
 
-    def __init__(self, consumer: Any) -> None:
-        """consumer: a started AIOKafkaConsumer with enable_auto_commit=False."""
+    def __init__(self, consumer: Any, errors: tuple[type[Exception], ...] = ()) -> None:
+        """consumer: a started AIOKafkaConsumer with enable_auto_commit=False; errors: that it raises."""
         self.consumer = consumer
+        self.errors = errors
         self.again: dict[Any, int] = {}  # by partition: the first record that is to come again
 
     async def fetch(self, most: int, seconds: float) -> Sequence[BrokerMessage]:
@@ -48,7 +49,10 @@ class KafkaDelivery:
     async def done(self) -> None:
         """Go on behind it, unless a record before it is to come again: then this one comes again, too."""
         if self._record.offset < self._broker.again.get(self._place, self._record.offset + 1):
-            await self._broker.consumer.commit({self._place: self._record.offset + 1})
+            try:
+                await self._broker.consumer.commit({self._place: self._record.offset + 1})
+            except self._broker.errors as error:
+                raise NotAcknowledged(type(error).__name__) from error
 
     async def again(self) -> None:
         """Read on from it."""
@@ -77,4 +81,4 @@ async def open_kafka(address: str) -> KafkaBroker:
         await consumer.start()
     except (KafkaError, OSError) as error:
         raise UserError(f"{address}: no Kafka broker answers ({type(error).__name__})") from error
-    return KafkaBroker(consumer)
+    return KafkaBroker(consumer, (KafkaError,))

@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 from typing import Any
 
 from sprung.service.errors import UserError
-from sprung.service.fleet.broker import AGAIN_SECONDS, TOGETHER, BrokerMessage
+from sprung.service.fleet.broker import AGAIN_SECONDS, TOGETHER, BrokerMessage, NotAcknowledged
 from sprung.service.fleet.sending import Answer
 from sprung.service.fleet.spool import SpoolEntry
 
 FIRST_ANSWER_SECONDS = 15.0
-PUBLISHED_SECONDS = 5.0  # for a message of kB; one that was on its way when the server died is sent again after that
+PUBLISHED_SECONDS = 5.0  # for a message of kB to a server that does not answer
+RECONNECT_SECONDS = 0.5  # between attempts of a consumer; there are few
 SUBJECT = "sprung.estimates"
 STREAM = "SPRUNG"
 DURABLE = "sprung-fold"
@@ -42,11 +43,11 @@ class NatsDelivery:
 
     async def done(self) -> None:
         """Acknowledge, and wait until the server knows."""
-        await self._message.ack_sync()
+        await _told(self._message.ack_sync())
 
     async def again(self) -> None:
         """Ask for it later."""
-        await self._message.nak(delay=AGAIN_SECONDS)
+        await _told(self._message.nak(delay=AGAIN_SECONDS))
 
 
 class NatsBroker:
@@ -102,6 +103,7 @@ class NatsLink:
         self._loop = asyncio.new_event_loop()
         self._connection: Any = None
         self._stream: Any = None
+        self._lost = asyncio.Event()  # the connection
 
     def send(self, entry: SpoolEntry) -> Answer:
         """Publish and wait until the server has it on disk; raw recordings are for HTTP."""
@@ -131,15 +133,35 @@ class NatsLink:
             self._loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
 
     async def _publish(self, body: bytes) -> None:
+        """Raises as soon as the connection is lost: whoever sends makes the pauses."""
         if self._stream is None:
-            self._connection = await _connected(self._servers)
+            self._lost = asyncio.Event()
+            self._connection = await _connected(self._servers, self._lost)
             self._stream = self._connection.jetstream()
             await _ensure_stream(self._stream)
         headers = {"Nats-Msg-Id": hashlib.sha256(body).hexdigest()}
-        await self._stream.publish(self._subject, body, headers=headers, timeout=PUBLISHED_SECONDS)
+        publishing = self._stream.publish(self._subject, body, headers=headers, timeout=PUBLISHED_SECONDS)
+        ways = [asyncio.ensure_future(publishing), asyncio.ensure_future(self._lost.wait())]
+        done, left = await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+        for one in left:
+            one.cancel()
+        if ways[0] not in done:
+            raise ConnectionResetError("the connection was lost")
+        await ways[0]
 
 
-async def _connected(servers: str) -> Any:
+async def _told(telling: Awaitable[Any]) -> None:
+    """Raises NotAcknowledged where the server does not hear it."""
+    from nats.errors import Error
+
+    try:
+        await telling
+    except (Error, OSError, TimeoutError) as error:
+        raise NotAcknowledged(type(error).__name__) from error
+
+
+async def _connected(servers: str, lost: asyncio.Event | None = None) -> Any:
+    """A connection that is made again by itself; with `lost`, one that sets it and ends instead.  Raises UserError."""
     try:
         import nats
         from nats.errors import Error
@@ -153,8 +175,20 @@ async def _connected(servers: str) -> Any:
         if isinstance(error, Error) and not refused:
             refused.append(error)
 
+    async def ended() -> None:
+        if lost is not None:
+            lost.set()
+
     where = without_password(servers)
-    connecting = nats.connect(servers, max_reconnect_attempts=-1, error_cb=heard, connect_timeout=5)
+    connecting = nats.connect(
+        servers,
+        allow_reconnect=lost is None,
+        max_reconnect_attempts=-1 if lost is None else 1,
+        reconnect_time_wait=RECONNECT_SECONDS,
+        error_cb=heard,
+        closed_cb=ended,
+        connect_timeout=5,
+    )
     try:  # later it connects again however long it takes; now an address may be wrong
         return await asyncio.wait_for(connecting, FIRST_ANSWER_SECONDS)
     except (Error, OSError) as error:

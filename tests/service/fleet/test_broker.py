@@ -134,6 +134,30 @@ def test_a_message_that_cannot_be_folded_does_not_hold_up_the_others(
     assert (counts.messages, counts.refused) == (2, 1)
 
 
+def test_an_acknowledgement_that_the_broker_does_not_take_ends_nothing(
+    pipeline: Pipeline, bodies: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was away when the first batch was stored: the same records come again, and change nothing."""
+    kafka, away = FakeKafka(list(bodies)), [ConnectionError("no coordinator")]
+    commit = kafka.commit
+
+    async def fails_once(offsets: dict[str, int]) -> None:
+        if away:
+            kafka.at = 0  # the partition was given to somebody anew
+            raise away.pop()
+        await commit(offsets)
+
+    monkeypatch.setattr(kafka, "commit", fails_once)
+    counts = ConsumerCounts()
+
+    async def opened() -> Broker:
+        return KafkaBroker(kafka, (ConnectionError,))
+
+    asyncio.run(until(opened, Ingest(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 4))
+    assert pipeline.state("north-1").used == 40
+    assert counts.messages == 8
+
+
 @pytest.fixture
 def nats_server(tmp_path: Path) -> Iterator[tuple[str, Callable[[], None]]]:
     """Its address, and how to kill it and start it anew."""
@@ -200,6 +224,46 @@ def test_nats_keeps_messages_over_kills_of_both_sides(
     asyncio.run(until(opened, ingest, counts, lambda: counts.messages >= 4))
     assert pipeline.state("north-1").used == 40
     assert counts.messages == 4  # each once: the server dropped what was published twice
+
+
+def test_a_nats_server_that_is_killed_is_missed_at_once_and_found_again_soon(
+    nats_server: tuple[str, Callable[[], None]], pipeline: Pipeline, bodies: list[bytes]
+) -> None:
+    """The sender does not wait for an answer that a dead server owes, nor the consumer for its acknowledgement."""
+    address, kill_and_start = nats_server
+    link = NatsLink(address, "north-1")
+    assert link.send(SpoolEntry(1, "estimates", "", bodies[0])).stored
+    counts = ConsumerCounts()
+
+    async def killed_before_the_acknowledgement() -> None:
+        broker, stopping = await NatsBroker.open(address, ack_seconds=0.5), asyncio.Event()
+        ingest, killed = Ingest(pipeline, 0.0, Clock()), [False]
+
+        class Killing:
+            """Stores, then the server goes: once."""
+
+            def take(self, found: Sequence[Any]) -> list[Any]:
+                taken = ingest.take(found)
+                if not killed[0]:
+                    killed[0] = True
+                    kill_and_start()
+                return list(taken)
+
+        task = asyncio.create_task(consume(broker, Killing(), stopping, counts))  # type: ignore[arg-type]
+        await asyncio.sleep(0.5)
+        begun = time.monotonic()
+        while not (await asyncio.to_thread(link.send, SpoolEntry(1, "estimates", "", bodies[1]))).stored:
+            await asyncio.sleep(0.05)
+        while pipeline.state("north-1").used < 20 and time.monotonic() - begun < 10.0:
+            await asyncio.sleep(0.05)
+        assert time.monotonic() - begun < 4.0
+        stopping.set()
+        await task
+        await broker.close()
+
+    asyncio.run(killed_before_the_acknowledgement())
+    link.close()
+    assert pipeline.state("north-1").used == 20
 
 
 def test_who_has_no_password_is_not_let_in_and_no_line_shows_one(
