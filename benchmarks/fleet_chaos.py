@@ -2,8 +2,9 @@
 
 Some vehicles publish estimates to NATS JetStream, which two processes (`sprung fleet consume`) fold into PostgreSQL
 with `fsync`; where Ray is installed, the others post theirs to Ray Serve (`sprung fleet serve`).  Every so often one of
-these is killed and, unless Ray does it, started anew: NATS, a consumer, the database, a replica of Serve, or the head
-of the Ray cluster.  At the end the store is compared with one that was filled by one process, in order, undisturbed.
+these is killed and, unless Ray or the command does it, started anew: NATS, a consumer, the database, a replica of Serve
+or its door, Ray's head, or the command with all of Ray.  At the end the store is compared with one that was filled by
+one process, in order, undisturbed.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -102,8 +103,8 @@ def chaos(minutes: float, every: float) -> Figures:
             KilledPart("postgresql", lambda: _started(server), lambda _: os.kill(server.pid(), signal.SIGKILL), NAMES),
         ]
         if posting:
-            head = KilledPart("head of Ray", lambda: _serving(port, url, folder / "ray"), _kill_head, posting)
-            parts += [head, KilledPart("replica of Serve", lambda: None, lambda _: _kill_replica(head), posting)]
+            ray = KilledPart("all of Ray", lambda: _serving(port, url, folder / "ray"), _kill_all, posting)
+            parts += [ray, *_parts_of(ray)]
         for part in parts:
             if part.name != "postgresql":
                 part.process = part.start()
@@ -267,28 +268,45 @@ def _worker(address: str, url: str, folder: Path) -> subprocess.Popen[bytes]:
 
 def _serving(port: int, url: str, folder: Path) -> subprocess.Popen[bytes]:
     """Ray Serve on this machine; returns when requests are taken."""
-    command = [sys.executable, "-m", "sprung", "fleet", "serve", "--store", url, "--port", str(port), "--cores", "0.5"]
+    command = [sys.executable, "-m", "sprung", "fleet", "serve", "--store", url, "--port", str(port), "--cores", "0.4"]
+    sizes = ["--workers", "2", "--replicas", "2", "--least", "2"]
     running = subprocess.Popen(
-        [*command, "--workers", "2", "--replicas", "1"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        [*command, *sizes], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         env=os.environ | {"SPRUNG_DATA_DIR": str(folder)}, start_new_session=True,
     )  # fmt: skip
     _await(lambda: _listens(port) or running.poll() is not None, 240.0)
     return running
 
 
-def _kill_head(process: subprocess.Popen[bytes] | None) -> None:
-    """Kill the head's process; the command that started it has to notice, as whoever starts it anew waits for that."""
-    for pid in _below(process, "gcs_server"):
-        os.kill(pid, signal.SIGKILL)
-    if process is not None:
-        process.wait(LONGEST_WAIT)
+def _parts_of(ray: KilledPart) -> list[KilledPart]:
+    """Processes that the command, or Ray, starts anew."""
+    named = {
+        "head of Ray": ("gcs_server",),
+        "replica of Serve": ("ServeReplica:sprung:fold", "ServeReplica:sprung:identify"),
+        "door of Serve": ("ServeReplica:sprung:door",),
+    }
+    return [
+        KilledPart(name, lambda: None, lambda _, texts=texts: _kill_below(ray, *texts), ray.fed)  # type: ignore[misc]
+        for name, texts in named.items()
+    ]
 
 
-def _kill_replica(head: KilledPart) -> None:
-    """Kill one that folds or identifies; Ray starts another one."""
-    found = [pid for name in ("fold", "identify") for pid in _below(head.process, f"ServeReplica:sprung:{name}")]
+def _kill_below(part: KilledPart, *names: str) -> None:
+    """Kill one of the processes of a part, which starts another one itself."""
+    found = [pid for name in names for pid in _below(part.process, name)]
     if found:
-        os.kill(random.Random(len(found)).choice(found), signal.SIGKILL)
+        os.kill(random.Random(part.kills).choice(found), signal.SIGKILL)
+
+
+def _kill_all(process: subprocess.Popen[bytes] | None) -> None:
+    """Kill a process and all that it has started, as a machine that fails."""
+    if process is not None:
+        below = [one.pid for one in descendants(process.pid)]
+        process.kill()
+        for pid in below:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        process.wait()
 
 
 def _below(process: subprocess.Popen[bytes] | None, text: str) -> list[int]:
@@ -297,7 +315,7 @@ def _below(process: subprocess.Popen[bytes] | None, text: str) -> list[int]:
 
 
 def _end_part(part: KilledPart) -> None:
-    if part.name == "head of Ray" and part.process is not None:
+    if part.name == "all of Ray" and part.process is not None:
         part.process.terminate()  # it ends what it has started
         try:
             part.process.wait(60)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import http.client
-import socket
+import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -20,21 +21,21 @@ import numpy as np
 from sprung.model.signals import Estimate, FloatArray
 from sprung.service.api.live_ingest import ingest_app
 from sprung.service.errors import Busy, UserError
-from sprung.service.fleet.ingest import Ingest, Taken, read_messages
+from sprung.service.fleet.ingest import Taken, read_messages
 from sprung.service.fleet.message import Message, SentWindows, WindowEstimate
-from sprung.service.fleet.tasks import start_ray
-from sprung.service.monitoring.compute import Compute
+from sprung.service.fleet.ray_head import RayHead
+from sprung.service.fleet.ray_replicas import FoldReplica, IdentifyReplica
 from sprung.service.monitoring.engine import load_engine
-from sprung.service.monitoring.pipeline import Pipeline
-from sprung.service.processes.threads import one_thread_each
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
 
+log = logging.getLogger("sprung.ray")
 APPLICATION = "sprung"
 BUSY_BATCHES = 1.5  # of one replica, at work and waiting, beyond which another one is started
-PROBE_SECONDS = 2.0
+HEALTH_SECONDS = 1.0  # a replica that died is missed after that
+PROBE_SECONDS = 0.5
 PROBE_TIMEOUT = 10.0  # s: a machine that is busy answers late
-SILENT_PROBES = 5
+SILENT_SECONDS = 10.0  # without an answer
 ABANDON_SECONDS = 10.0
 
 
@@ -43,44 +44,14 @@ class ServingSizes:
     """How much, at most."""
 
     replicas: int = 8  # of each of the two that compute
+    least: int = 1  # of these; with two, one that dies is not missed
+    more_after_seconds: float = 10.0  # of more requests than they should have
+    fewer_after_seconds: float = 120.0  # of fewer: one that starts imports for seconds
     cores: float = 1.0  # of a replica that identifies
     batch_windows: int = 32
     batch_messages: int = 64
     batch_wait_seconds: float = 0.02
     queued: int = 256  # requests for each replica that wait; more are 429
-
-
-class IdentifyReplica:
-    """Windows of any vehicles -> estimates."""
-
-    def __init__(self, settings: Settings) -> None:
-        one_thread_each()
-        self._engine = load_engine(settings)
-
-    async def identify(self, starts: list[int], values: FloatArray) -> list[Estimate]:
-        """The estimates of windows, values (B, T, C)."""
-        return (await asyncio.to_thread(self._engine.identify, values, starts=starts))[0]
-
-
-class FoldReplica:
-    """Messages of any vehicles -> trackers and store."""
-
-    def __init__(self, settings: Settings) -> None:
-        one_thread_each()
-        store = open_store(settings.store_url)
-        pipeline = Pipeline(load_engine(settings), store, Compute(1), vehicles_in_memory=settings.vehicles_in_memory)
-        self._ingest = Ingest(pipeline, settings.late_seconds)
-        self._ingest.start()
-
-    async def fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
-        """What became of each message; they are stored, but for those with an error."""
-        return await asyncio.to_thread(self._fold, messages)
-
-    def _fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
-        try:
-            return list(self._ingest.take(messages))
-        except UserError as error:  # one of them spoils it for the others
-            return [error] if len(messages) == 1 else [self._fold([one])[0] for one in messages]
 
 
 class RayBehind:
@@ -140,28 +111,38 @@ class RayBehind:
 
 
 async def _asked(pending: Any) -> Any:
-    from ray.exceptions import RayTaskError
+    from ray.exceptions import RayError, RayTaskError
 
     try:
         return await pending
     except RayTaskError as error:
         raise error.cause from None
+    except RayError as error:  # another one takes its place
+        raise Busy(f"a replica ended with the request in its hands ({type(error).__name__}); try again") from error
 
 
 def application(settings: Settings, sizes: ServingSizes) -> Any:
     """The Serve application: `serve.run(application(...))`."""
     from ray import serve
 
-    scaling = {"min_replicas": 1, "max_replicas": sizes.replicas, "target_ongoing_requests": BUSY_BATCHES}
-    shared: dict[str, Any] = {
-        "autoscaling_config": scaling,
-        "max_ongoing_requests": 1,  # batches: they compute
-        "health_check_period_s": 5,
+    least = min(sizes.least, sizes.replicas)
+    scaling = {
+        "min_replicas": least,
+        "max_replicas": sizes.replicas,
+        "target_ongoing_requests": BUSY_BATCHES,
+        "upscale_delay_s": sizes.more_after_seconds,
+        "downscale_delay_s": sizes.fewer_after_seconds,
+    }
+    watched: dict[str, Any] = {
+        "health_check_period_s": HEALTH_SECONDS,
         "graceful_shutdown_timeout_s": settings.shutdown_seconds,
     }
+    # one request at a time: it is a batch, and they compute
+    shared = watched | {"autoscaling_config": scaling, "max_ongoing_requests": 1}
     cores = {"num_cpus": sizes.cores}
-    identify = serve.deployment(IdentifyReplica, name="identify", ray_actor_options=cores, **shared)
-    fold = serve.deployment(FoldReplica, name="fold", ray_actor_options={"num_cpus": sizes.cores / 2}, **shared)
+    deployment: Any = serve.deployment
+    identify = deployment(IdentifyReplica, name="identify", ray_actor_options=cores, **shared)
+    fold = deployment(FoldReplica, name="fold", ray_actor_options={"num_cpus": sizes.cores / 2}, **shared)
 
     def build() -> Any:
         """The door's ASGI application; runs in its replica."""
@@ -181,35 +162,41 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
         def __init__(self, *after: Any) -> None:
             """after: deployments that are started before it."""
 
-    door = serve.deployment(
+    door = deployment(
         serve.ingress(build)(Door),
         name="door",
         num_replicas=1,
         ray_actor_options={"num_cpus": sizes.cores / 4},
         max_ongoing_requests=8 * sizes.queued,
+        **watched,
     )
     return door.bind(identify.bind(settings), fold.bind(settings))
 
 
 def start(
     settings: Settings, sizes: ServingSizes, host: str, port: int, address: str | None, cores: int | None
-) -> None:
-    """Serve on the cluster at `address`, or on a Ray that is started here; returns when requests are taken."""
+) -> RayHead | None:
+    """Serve on the cluster at `address`, or on a Ray that is started here; returns when requests are taken.
+
+    The head of a Ray that was started here.
+    """
     try:
         import ray
         from ray import serve
     except ModuleNotFoundError as error:
         raise UserError("Ray is not installed: pip install 'sprung[fleet]'") from error
+    head = None
     if address:
         ray.init(address=address)
     else:
-        start_ray(cores)
+        head = RayHead(cores)
     serve.start(http_options={"host": host, "port": port})
     serve.run(application(settings, sizes), name=APPLICATION, route_prefix="/")
+    return head
 
 
-def stop() -> None:
-    """Answer pending requests, then leave the cluster, or end the one that was started here.
+def stop(head: RayHead | None) -> None:
+    """Answer pending requests, then leave the cluster, or end the one that was started here: that of `head`.
 
     Only the application goes: a cluster may serve others, and Serve itself ends with its Ray.
     """
@@ -218,29 +205,36 @@ def stop() -> None:
 
     serve.delete(APPLICATION)
     ray.shutdown()
+    if head is not None:
+        head.close()
 
 
-def abandon() -> None:
+def abandon(head: RayHead | None) -> None:
     """End what was started here without answers; waits for Ray only briefly."""
     import ray
 
     leaving = threading.Thread(target=ray.shutdown, daemon=True)
     leaving.start()
     leaving.join(ABANDON_SECONDS)
+    if head is not None:
+        head.close()
 
 
-def watch(stopping: threading.Event, host: str, port: int, own: bool) -> bool:
-    """Wait until `stopping` is set: true; or until nobody takes requests any more, or the head of a Ray that was
-    started here is gone: false.  Whoever started the process then starts it anew."""
-    import ray
+def watch(stopping: threading.Event, host: str, port: int, head: RayHead | None) -> bool:
+    """Wait until `stopping` is set: true; or until nobody takes requests any more: false.  Whoever started the process
+    then starts it anew.
 
-    head_host, _, head_port = ray.get_runtime_context().gcs_address.rpartition(":")
-    silent = 0
+    head: of a Ray that was started here; one that dies is started anew, and requests are answered meanwhile.
+    """
+    answered = time.monotonic()
     while not stopping.wait(PROBE_SECONDS):
-        if own and not _listens(head_host, int(head_port)):
-            return False
-        silent = 0 if _answers(host, port) else silent + 1
-        if silent >= SILENT_PROBES:
+        if head is not None and not head.lives():
+            log.warning("Ray's head has died; starting it anew")
+            if not head.start_anew():
+                return False
+        if _answers(host, port):
+            answered = time.monotonic()
+        elif time.monotonic() - answered > SILENT_SECONDS:
             return False
     return True
 
@@ -256,15 +250,8 @@ def _answers(host: str, port: int) -> bool:
         connection.close()
 
 
-def _listens(host: str, port: int) -> bool:
-    try:
-        socket.create_connection((host, port), PROBE_TIMEOUT).close()
-    except OSError:
-        return False
-    return True
-
-
 def from_environment(arguments: dict[str, str]) -> Any:
     """The application as `import_path` of a Serve configuration: settings from SPRUNG_..., sizes from its `args`."""
-    sizes = ServingSizes(replicas=int(arguments.get("replicas", 8)), cores=float(arguments.get("cores", 1.0)))
+    replicas, least = int(arguments.get("replicas", 8)), int(arguments.get("least", 1))
+    sizes = ServingSizes(replicas=replicas, least=least, cores=float(arguments.get("cores", 1.0)))
     return application(settings_with({}), sizes)

@@ -129,6 +129,7 @@ def serve(
     ] = None,
     workers: Workers = None,
     replicas: Annotated[int, typer.Option("--replicas", min=1, help="Of each deployment, at most.")] = 8,
+    least: Annotated[int, typer.Option("--least", min=1, help="Of these; with 2, one that dies is not missed.")] = 1,
     cores: Annotated[float, typer.Option("--cores", min=0.1, help="Of a replica that identifies.")] = 1.0,
     system: System = None,
     weights: Weights = None,
@@ -139,7 +140,7 @@ def serve(
     from sprung.service.cli.fleet import run_serve
 
     options = {"system": system, "weights": weights, "store": store, "host": host, "port": port}
-    return run_serve(options, ServingSizes(replicas=replicas, cores=cores), ray_address, workers)
+    return run_serve(options, ServingSizes(replicas=replicas, least=least, cores=cores), ray_address, workers)
 
 
 @fleet.command("consume")

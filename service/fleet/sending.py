@@ -69,6 +69,8 @@ class HttpLink:
             said += "; raw samples are for the server of the pages: name it with --recordings"
         if status in (401, 403, 408, 425, 429) or status >= 500:  # the token may be renewed, the server started anew
             return Answer(False, trouble=said, wait=wait)
+        if status == 404 and entry.kind == "estimates":  # Ray Serve that is starting, or another address
+            return Answer(False, trouble=said, wait=wait)
         if status == 409 and entry.kind == "recording":  # an earlier attempt is being worked on; it may fail yet
             return Answer(False, trouble=said, wait=wait)
         return Answer(False, refused=said)

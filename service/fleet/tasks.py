@@ -67,7 +67,7 @@ class RayTasks:
             import ray
         except ModuleNotFoundError as error:
             raise UserError("Ray is not installed: pip install 'sprung[fleet]'") from error
-        self._ray = ray
+        self._ray: Any = ray
         self._started = not ray.is_initialized()
         address = os.environ.get("RAY_ADDRESS")
         try:
@@ -77,7 +77,7 @@ class RayTasks:
                 start_ray(workers or os.cpu_count())
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise UserError(f"Ray: {str(error).splitlines()[0]}") from error
-        self.name = f"Ray, {ray.cluster_resources().get('CPU', 0):.0f} cores"
+        self.name = f"Ray, {self._ray.cluster_resources().get('CPU', 0):.0f} cores"
         self._remote: dict[Callable[..., Any], Any] = {}
 
     def submit(self, work: Callable[..., Any], *arguments: Any) -> Any:
@@ -104,8 +104,11 @@ class RayTasks:
             self._ray.shutdown()
 
 
-def start_ray(cores: int | None) -> None:
-    """A Ray of this process on this machine, that says nothing of itself; `cores`: default all."""
+def start_ray(cores: int | None, config: dict[str, Any] | None = None) -> None:
+    """A Ray of this process on this machine, that says nothing of itself.
+
+    cores: default all; config: Ray's own settings, by their names in its source.
+    """
     import ray
 
     logging.getLogger("ray").setLevel(logging.ERROR)
@@ -115,6 +118,7 @@ def start_ray(cores: int | None) -> None:
         include_dashboard=False,
         log_to_driver=False,
         configure_logging=False,
+        _system_config=config,
     )
 
 

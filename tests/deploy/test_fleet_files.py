@@ -75,4 +75,4 @@ def test_ray_takes_the_configuration_of_its_application() -> None:
         d for d in yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()) if d["kind"] == "RayService"
     )
     config = schema.ServeDeploySchema.model_validate(yaml.safe_load(document["spec"]["serveConfigV2"]))
-    assert config.applications[0].args == {"replicas": 32, "cores": 1}
+    assert config.applications[0].args == {"replicas": 32, "least": 2, "cores": 1}

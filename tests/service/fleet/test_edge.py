@@ -120,17 +120,17 @@ class ReceiverHandler(BaseHTTPRequestHandler):
 
 
 def test_statuses_say_whether_to_try_again() -> None:
-    receiver = EdgeReceiver([200, 429, 503, 401, 422, 409])
+    receiver = EdgeReceiver([200, 429, 503, 401, 404, 422, 409])
     thread = threading.Thread(target=receiver.serve_forever, daemon=True)
     thread.start()
     link = HttpLink(f"http://127.0.0.1:{receiver.server_port}/base", "sprung_x_y", "north-1")
-    found = [link.send(SpoolEntry(i, "estimates", "", b"body")) for i in range(6)]
+    found = [link.send(SpoolEntry(i, "estimates", "", b"body")) for i in range(7)]
     recording = link.send(SpoolEntry(9, "recording", "north-1-x.mcap", b"\x89MCAP"))
     receiver.shutdown()
     receiver.server_close()
     link.close()
-    assert [answer.stored for answer in found] == [True, False, False, False, False, False]
-    assert [bool(answer.refused) for answer in found] == [False, False, False, False, True, True]
+    assert [answer.stored for answer in found] == [True] + 6 * [False]
+    assert [bool(answer.refused) for answer in found] == 5 * [False] + [True, True]
     path, headers, body = receiver.requests[0]
     assert (path, headers["Authorization"], body) == ("/base/ingest/estimates", "Bearer sprung_x_y", b"body")
     assert recording.stored

@@ -1,0 +1,50 @@
+"""What computes behind the door of Ray Serve.  Imports no more than it needs: that is most of a replica's start."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+
+from sprung.model.signals import Estimate, FloatArray
+from sprung.service.errors import UserError
+from sprung.service.fleet.ingest import Ingest, Taken
+from sprung.service.fleet.message import Message
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import load_engine
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.processes.threads import one_thread_each
+from sprung.service.settings import Settings
+from sprung.service.store import open_store
+
+
+class IdentifyReplica:
+    """Windows of any vehicles -> estimates."""
+
+    def __init__(self, settings: Settings) -> None:
+        one_thread_each()
+        self._engine = load_engine(settings)
+
+    async def identify(self, starts: list[int], values: FloatArray) -> list[Estimate]:
+        """The estimates of windows, values (B, T, C)."""
+        return (await asyncio.to_thread(self._engine.identify, values, starts=starts))[0]
+
+
+class FoldReplica:
+    """Messages of any vehicles -> trackers and store."""
+
+    def __init__(self, settings: Settings) -> None:
+        one_thread_each()
+        store = open_store(settings.store_url)
+        pipeline = Pipeline(load_engine(settings), store, Compute(1), vehicles_in_memory=settings.vehicles_in_memory)
+        self._ingest = Ingest(pipeline, settings.late_seconds)
+        self._ingest.start()
+
+    async def fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
+        """What became of each message; they are stored, but for those with an error."""
+        return await asyncio.to_thread(self._fold, messages)
+
+    def _fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
+        try:
+            return list(self._ingest.take(messages))
+        except UserError as error:  # one of them spoils it for the others
+            return [error] if len(messages) == 1 else [self._fold([one])[0] for one in messages]

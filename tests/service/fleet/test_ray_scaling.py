@@ -1,0 +1,60 @@
+"""Replicas of Ray Serve are added while requests wait for them, and taken away after that."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sprung.model.system import System
+from sprung.service.api import ray_serving
+from sprung.service.api.ray_serving import APPLICATION, ServingSizes
+from sprung.service.settings import Settings
+
+serve: Any = pytest.importorskip("ray.serve")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
+SIZES = ServingSizes(replicas=2, cores=0.5, more_after_seconds=1.0, fewer_after_seconds=3.0)
+
+
+def running() -> int:
+    """Replicas that identify."""
+    found = serve.status().applications[APPLICATION].deployments["identify"].replica_states
+    return int(found.get("RUNNING", 0))
+
+
+def becomes(fulfilled: Callable[[], bool], seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    while not fulfilled():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.2)
+    return True
+
+
+def test_replicas_come_with_the_load_and_go_with_it(system: System, tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    settings = Settings(data_dir=tmp_path, store=f"sqlite:///{tmp_path}/sprung.db")
+    head = ray_serving.start(settings, SIZES, "127.0.0.1", port, None, 2)
+    try:
+        identify = serve.get_deployment_handle("identify", APPLICATION).identify
+        assert running() == 1
+        windows = np.random.default_rng(1).normal(size=(32, system.window, len(system.channels)))
+        waiting = [identify.remote(list(range(32)), 0.01 * windows) for _ in range(4)]
+        count = len(waiting)
+        while running() < 2 and count < 400:
+            waiting = [one for one in waiting if len(one.result(timeout_s=120)) != 32]  # they come to nothing else
+            waiting += [identify.remote(list(range(32)), 0.01 * windows) for _ in range(8)]
+            count += 8
+        for one in waiting:
+            assert len(one.result(timeout_s=120)) == 32
+        assert running() == 2
+        assert becomes(lambda: running() == 1, 60.0)
+    finally:
+        ray_serving.stop(head)
