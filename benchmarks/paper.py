@@ -76,7 +76,7 @@ def run(
             settings.folder.mkdir(parents=True, exist_ok=True)
             try:
                 for row in rows(settings):
-                    row |= {"commit": commit(), "sources": paper_settings.sources()}
+                    row |= {"commit": commit(), "sources": paper_settings.sources(), "arithmetic": arithmetic()}
                     _keep(settings, row)
                     yield row
             except OutOfTime as stop:
@@ -96,6 +96,11 @@ def commit() -> str:
     except (OSError, subprocess.SubprocessError):
         return "unknown"
     return found.stdout.strip()
+
+
+def arithmetic() -> str:
+    """What decides the last bits of a sum, and so where a training ends: vector instructions and torch's version."""
+    return f"{torch.backends.cpu.get_cpu_capability()}, torch {torch.__version__}"
 
 
 def _keep(settings: PaperSettings, row: dict[str, Any]) -> None:

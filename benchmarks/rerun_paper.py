@@ -1,8 +1,8 @@
 """`sprung bench paper-cells`: random figures of docs/paper.md made again from nothing, and held against what it states.
 
 Only tables that say which seeds they were made from, below them or line by line, are drawn from.  A figure of one seed
-must come out again to the four digits that are printed; one of several seeds within three of its standard deviations,
-from the first seed.
+must come out again to the four digits that are printed, on a processor with the vector instructions that it was made
+with (the page says which); one of several seeds within three of its standard deviations, from the first seed.
 """
 
 from __future__ import annotations
@@ -67,6 +67,7 @@ def run(
         yield {
             "task": cell.task, "method": cell.method, "column": cell.column, "stated": cell.mean,
             "spread": cell.spread, "seeds": list(cell.seeds), "again": again, "within": within,
+            "arithmetic": paper.arithmetic(),
         }  # fmt: skip
 
 

@@ -74,7 +74,8 @@ def cell(rows: Sequence[dict[str, Any]], column: str) -> str:
     if not values:
         return "-" if paper is None else f"- ({paper:.4g})"
     text = f"{np.mean(values):.4g}"
-    if len(values) > 1:
+    counts = all(isinstance(value, int) for value in values) and len(set(values)) == 1
+    if len(values) > 1 and not counts:
         text += f" ± {np.std(values, ddof=1):.2g}"
     return text if paper is None else f"{text} ({paper:.4g})"
 

@@ -301,6 +301,7 @@ def test_the_bench_says_what_it_does_not_know() -> None:
 def test_the_bench_gives_the_kernels_and_their_picture(tmp_path: Path) -> None:
     rows = list(paper.run("kernels", out=tmp_path))
     assert [row["method"] for row in rows] == ["none", "k_DFT", "k_MAG", "k_PHA"]
+    assert all(row["commit"] and row["sources"] and "torch" in row["arithmetic"] for row in rows)
     assert (tmp_path / "quick" / "pictures" / "kernels.png").is_file()
 
 
