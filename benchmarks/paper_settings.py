@@ -18,14 +18,16 @@ EXTRA = (
 
 
 _ROOT = Path(__file__).resolve().parent.parent
+_ROWS_OF = ("paper_*", "drifting", "phase_information", "window_information")  # modules beside this one that make rows
 
 
 @cache
 def sources() -> str:
     """Digest of the code that makes the rows: systems, methods, training, figures.  Rows of other code are stale."""
     digest = hashlib.sha256()
-    files = [*(_ROOT / "model" / "alps").glob("*.py"), *(_ROOT / "benchmarks").glob("paper_*.py")]
-    for path in sorted(path for path in files if path.stem not in ("paper_report", "paper_pictures")):
+    files = [*(_ROOT / "model" / "alps").glob("*.py")]
+    files += [path for name in _ROWS_OF for path in (_ROOT / "benchmarks").glob(f"{name}.py")]
+    for path in sorted(path for path in files if path.stem != "paper_pictures"):
         digest.update(path.name.encode() + path.read_bytes())
     return digest.hexdigest()[:12]
 

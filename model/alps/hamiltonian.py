@@ -10,6 +10,7 @@ that its gradient is written down rather than traced: W' (v sigmoid(W x + b)).
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -49,14 +50,16 @@ class HamiltonianDynamics(Context):
         by_x = (self.weight * torch.sigmoid(self.hidden(x))) @ self.hidden.weight
         by_place = torch.zeros_like(place)
         for column, (index, slope) in enumerate(slopes):
-            by_place = by_place.index_add(1, torch.tensor([index]), (by_x[:, column] * slope)[:, None])
+            here = torch.tensor([index], device=place.device)
+            by_place = by_place.index_add(1, here, (by_x[:, column] * slope)[:, None])
         return by_place, by_x[:, len(columns) : len(columns) + rate.shape[1]] + torch.exp(self.mass) * rate
 
     def forward(self, start: Tensor, context: Tensor, inputs: Tensor) -> Tensor:
         """Roll out from start (B S, N) with one context per window (B, 10) -> (B S, T, N)."""
         context = context.repeat_interleave(len(start) // len(context), dim=0)
         inputs = self.scaled(inputs)
-        size = torch.where(torch.tensor([i in self.task.angles for i in range(len(self.scale))]), 1.0, self.scale)
+        turns = torch.tensor([i in self.task.angles for i in range(len(self.scale))], device=start.device)
+        size = torch.where(turns, 1.0, self.scale)
         place, rate = (start / size)[:, self.places], (start / size)[:, self.rates]
         damping = torch.exp(self.friction)
         path = [torch.cat([place, rate], dim=-1)]
@@ -67,5 +70,5 @@ class HamiltonianDynamics(Context):
                 rate = rate + (push - by_place - damping * by_rate) / _INNER
                 place = place + self.gradient(place, rate, context)[1] / _INNER
             path.append(torch.cat([place, rate], dim=-1))
-        order = torch.argsort(torch.tensor([*self.places, *self.rates]))
+        order = np.argsort([*self.places, *self.rates]).tolist()
         return torch.stack(path, dim=1)[..., order] * size

@@ -44,6 +44,15 @@ def test_every_method_trains_on_a_driven_and_on_a_turning_system(method: str, tm
             assert torch.isfinite(weight).all(), (task.name, name)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_no_method_makes_tensors_on_another_device_than_its_own(method: str) -> None:
+    for task in (mass_spring_damper.TASK, two_body.TASK):  # a von Mises posterior asks its values, which meta has not
+        network = Network(task, method, SIZES).to("meta").eval()
+        inputs = torch.zeros(2, WINDOW, task.inputs, dtype=torch.float64, device="meta")
+        passed = network(torch.zeros(2, WINDOW, SIZES.embedding, device="meta"), inputs, 9)
+        assert passed.simulated.device.type == "meta"
+
+
 def test_leave_one_out_recipes_leave_out_one_thing() -> None:
     fields = ("straight", "opening", "positions_shown", "phased", "tempered", "falling_prior")
     helped = RECIPES["alps"]
