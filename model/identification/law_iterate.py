@@ -57,10 +57,9 @@ class LinearStep:
 
     def take(self, at: Tensor) -> LinearStep:
         """Some of the windows."""
-        v, d = self.values, self.discrete
-        coupling = None if v.coupling is None else v.coupling[at]
+        d = self.discrete
         return LinearStep(
-            ElementValues(v.stiffness[at], v.damping[at], v.mass[at], coupling),
+            self.values.take(at),
             Discrete(d.Ad[at], d.G0[at], d.G1[at], d.C[at], d.D[at]),
             (
                 self.force_response[0][at],

@@ -310,9 +310,9 @@ class LawWindows:
         first, memory = load.new_zeros(B, N, N + columns), load.new_zeros(B, memories, N + columns)
         first[:, :, :N] = torch.eye(N, dtype=torch.float64)
         memory[:, :, N + self.reported :] = torch.eye(memories, dtype=torch.float64)
-        path = tangent.run(
-            excitation, self._force_sources(along, point, steps, N), first, memory=memory
-        )  # (B, T, N + L, X)
+        given = self._force_sources(along, point, steps, N)
+        excitation += self._between_samples(given[..., N:], steps, tangent)
+        path = tangent.run(excitation, given, first, memory=memory)  # (B, T, N + L, X)
         found = self._compressed_outputs(path, steps, Q)
         changed = found[..., N:]
         direct = Q @ (steps.force_rows[:, which] - steps.direct @ self.model.simulator.H[which].T)  # (B, R, P')
@@ -350,12 +350,25 @@ class LawWindows:
         for gain, at in ((G0, slice(0, T - 1)), (G1, slice(1, T))):
             excitation += gain[:, :, 2 * of].unsqueeze(1) * value[:, at, None]
             excitation += gain[:, :, 2 * of + 1].unsqueeze(1) * rate[:, at, None]
+        excitation += self._between_samples(force, steps, tangent)
         path = tangent.run(excitation, force, torch.zeros(B, G0.shape[1], X, dtype=torch.float64), memory_source)
         shown = self._compressed_outputs(path, steps, Q)
         D = Q @ steps.discrete.D
         for gain, given in ((D[:, :, 2 * of], value), (D[:, :, 2 * of + 1], rate)):
             shown += gain.unsqueeze(1) * given.unsqueeze(2)
         return list((columns.whiten @ self._spectra(shown)).to(torch.complex64).split(half, dim=3))
+
+    def _between_samples(self, force: Tensor, steps: LinearStep, tangent: TangentModel) -> Tensor:
+        """What known variations of the laws' forces (B, T, L, X) change of the states (B, T-1, N, X) over a sample
+        because between samples they are splines, as in `simulate`, and not straight lines, as in the tangent model."""
+        B, T, L, X = force.shape
+        sharp = (self.spline_compensation @ force.reshape(B, T, L * X)).view(B, T, L, X)
+        slope = (self.slope @ sharp.view(B, T, L * X)).view(B, T, L, X)
+        gains = [-block @ self.pull.T for block in steps.force_response]
+        gain = torch.cat([*gains, -tangent.g0, -tangent.g1], dim=2).unsqueeze(1)  # (B, 1, N, 6L)
+        ends = (sharp[:, :-1], slope[:, :-1], sharp[:, 1:], slope[:, 1:], force[:, :-1], force[:, 1:])
+        found: Tensor = gain @ torch.cat(ends, dim=2)
+        return found
 
     def _compressed_outputs(self, path: Tensor, steps: LinearStep, Q: Tensor) -> Tensor:
         """Variations of the compressed signals (B, T, R, X) for those of states and laws' forces (B, T, N + L, X)."""

@@ -196,7 +196,8 @@ class ElementLaw(Parametrised):
     memory_start: Callable[[Motion, Values, SpringDamper], Any] = empty_memory  # at the first sample
     # The same along a whole motion (T, ...), quicker: of a sample and the memory there
     memory_rates: Callable[[Motion, Values], Callable[[int, FloatArray], FloatArray]] | None = None
-    # Fast linear decay of each state, 1/s, shape (memory, ...): integrated exactly by the simulation
+    # Fast linear decay of each state, 1/s, shape (memory, ...), integrated exactly: rate + decay * state depends on the
+    # motion alone
     memory_decay: Callable[[Values, SpringDamper], Any] | None = None
     # Deflection over which a memory turns, m: a simulation takes no longer steps; None: as the element's modes need
     turns_over: Callable[[Values], Any] | None = None

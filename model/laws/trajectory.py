@@ -91,6 +91,10 @@ def recall(
             nb = half(i, z + h / 2 * na)
             path[i + 1] = z + h / 6 * (n0 + 2 * (na + nb) + node(i + 1, z + h * nb))
         return np.moveaxis(path, 0, -1)
+    if law.memory_decay:
+        clock = time.reshape(-1, *(1 for _ in shape))
+        between = Motion(d_half, v_half, clock[:-1] + h / 2)
+        return np.moveaxis(step.decayed(path, Motion(d, v, clock), between), 0, -1)
     for i in range(len(time) - 1):
         t = float(time[i])
         middle = d_half[i], v_half[i], t + h / 2
@@ -124,6 +128,27 @@ class MemoryStep:
         nb = self.source(*middle, self.half * z + self.q * na)
         nc = self.source(*end, self.half * a + self.q * (2 * nb - n0))
         return self.full * z + self.f1 * n0 + self.f2 * (na + nb) + self.f3 * nc
+
+    def decayed(self, path: FloatArray, ends: Motion, middle: Motion) -> FloatArray:
+        """`advance` along a whole motion of a law whose states decay: `path` (T, memory, ...) from its first entry.
+
+        ends: the motion at every sample, (T, ...); middle: between them, (T-1, ...).  What drives such states does not
+        depend on them (`ElementLaw.memory_decay`), so that it is known for all steps at once.
+        """
+        lanes = path.shape[2:]
+        none = np.zeros((self.law.memory, *(1 for _ in path.shape[1:])))
+        at_ends, between = (
+            np.broadcast_to(
+                self.law.memory_rate(motion._replace(memory=none), self.p, self.element),
+                (self.law.memory, len(motion.time), *lanes),
+            ).swapaxes(0, 1)
+            for motion in (ends, middle)
+        )
+        push = self.f1 * at_ends[:-1] + 2 * self.f2 * between + self.f3 * at_ends[1:]
+        for i, added in enumerate(push):
+            np.multiply(self.full, path[i], out=path[i + 1])
+            path[i + 1] += added
+        return path
 
     def source(self, d: FloatArray, v: FloatArray, t: float | FloatArray, z: FloatArray) -> FloatArray:
         found: FloatArray = self.law.memory_rate(Motion(d, v, t, z), self.p, self.element)

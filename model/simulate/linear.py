@@ -53,6 +53,11 @@ class ElementValues:
         root = self.mass.sqrt()
         return torch.diag_embed(self.mass) + root[:, :, None] * self.coupling * root[:, None]
 
+    def take(self, at: Tensor) -> ElementValues:
+        """Some of the vectors."""
+        coupling, reach = (None if part is None else part[at] for part in (self.coupling, self.reach))
+        return ElementValues(self.stiffness[at], self.damping[at], self.mass[at], coupling, reach)
+
     def accelerated(self, forces: Tensor) -> Tensor:
         """Accelerations under generalised forces (B, n, X)."""
         if self.coupling is None:
