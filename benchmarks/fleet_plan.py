@@ -8,6 +8,7 @@ bends is where one server's cores are all busy.
 from __future__ import annotations
 
 import heapq
+import pickle
 import tempfile
 import time
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_json
 from sqlalchemy import text
 
 from sprung.model.identification.excitation import simulate_runs
@@ -56,6 +58,8 @@ class FleetStages:
     window_bytes: float  # in the store, indices included
     rollup_bytes: float  # a vehicle and day
     parquet_bytes: float  # a window in the archive
+    state_bytes: float  # a vehicle's tracker as it is stored
+    memory_bytes: float  # and in memory
     store: str
 
     def figures(self) -> Figures:
@@ -70,6 +74,12 @@ class FleetStages:
         ):
             yield {"figure": f"processor time a window, {name}", "value": round(1e3 * value, 3), "unit": "ms"}
         yield {"figure": "store, bytes a window", "value": round(self.window_bytes), "on": self.store}
+        yield {"figure": "archive, bytes a window", "value": round(self.parquet_bytes)}
+        yield {
+            "figure": "tracker state, bytes",
+            "value": round(self.state_bytes),
+            "in_memory": round(self.memory_bytes),
+        }
 
 
 def measured_stages(vehicles: int = 12, seconds: float = 30.0) -> FleetStages:
@@ -116,6 +126,8 @@ def _stored(engine: Any, estimates: list[Any], vehicles: int, alone: float, batc
         each = [{f"live-{v}": [(at, found[v])] for v in range(vehicles)} for at, found in estimates[:together]]
         fold_live, database_live = _fold(pipeline, each, running)
         parquet = _parquet_bytes(store, Path(folder))
+        state = pipeline.state("plan-0")
+        states = float(len(to_json(state.to_dict()))), float(len(pickle.dumps(state)))
         compute.close()
         store.close()
         if server is not None:
@@ -124,7 +136,7 @@ def _stored(engine: Any, estimates: list[Any], vehicles: int, alone: float, batc
     rollups = points * (4 * 8 * len(system.tracked) + 120)
     name = f"SQLite ({missing})" if missing else "PostgreSQL"
     times = (alone, batched, fold, database, together, fold_live, database_live)
-    return FleetStages(*times, size, rollups, parquet, name)
+    return FleetStages(*times, size, rollups, parquet, *states, name)
 
 
 def _fold(pipeline: Pipeline, parts: list[dict[str, list[tuple[int, Estimate]]]], running: Any) -> tuple[float, float]:
@@ -234,7 +246,7 @@ def plan(stages: FleetStages, vehicles: int) -> Figures:
     per_day = WINDOWS_PER_SECOND * 86_400 * RUNNING_SHARE
     store = vehicles * (KEPT_DAYS * per_day * stages.window_bytes + 730 * stages.rollup_bytes) / 1e9
     archive = vehicles * 365 * per_day * stages.parquet_bytes / 1e9
-    memory = vehicles * 60e3 / 1e9  # a tracker's state in memory, and its share of a pipeline
+    memory = vehicles * stages.memory_bytes / 1e9
     yield {"figure": "vehicles", "value": vehicles, "windows_per_second": peak, "running_share": RUNNING_SHARE}
     yield {"figure": "database", "value": round(store / 1e3, 1), "unit": "TB", "kept_days": KEPT_DAYS}
     yield {"figure": "archive of a year", "value": round(archive / 1e3, 1), "unit": "TB"}
