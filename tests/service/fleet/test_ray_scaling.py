@@ -42,8 +42,9 @@ def test_replicas_come_with_the_load_and_go_with_it(system: System, tmp_path: Pa
         port = int(probe.getsockname()[1])
     settings = Settings(data_dir=tmp_path, store=f"sqlite:///{tmp_path}/sprung.db")
     head = ray_serving.start(settings, SIZES, "127.0.0.1", port, None, 2)
+    handle = serve.get_deployment_handle("identify", APPLICATION)
     try:
-        identify = serve.get_deployment_handle("identify", APPLICATION).identify
+        identify = handle.identify
         assert running() == 1
         windows = np.random.default_rng(1).normal(size=(32, system.window, len(system.channels)))
         waiting = [identify.remote(list(range(32)), 0.01 * windows) for _ in range(4)]
@@ -57,4 +58,5 @@ def test_replicas_come_with_the_load_and_go_with_it(system: System, tmp_path: Pa
         assert running() == 2
         assert becomes(lambda: running() == 1, 60.0)
     finally:
+        handle.shutdown()  # its thread outlives Ray and would start another one
         ray_serving.stop(head)
