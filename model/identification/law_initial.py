@@ -6,7 +6,8 @@ Here the forces f at the samples are unknown like the initial state x0, and may 
     f = law(d, v) + error,    sensors = responses to x0 + responses to f + noise,
 
 with a standard deviation that decreases from one Gauss-Newton step to the next (weak-constraint estimation: Tremolet,
-Q. J. R. Meteorol. Soc. 132, 2006).  The windows of a batch share the responses of the system at their median values.
+Q. J. R. Meteorol. Soc. 132, 2006).  Laws that are gentler than their elements are followed along the motion instead.
+The windows of a batch share the responses of the system at their median values.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor
 
 from sprung.model.identification.gauss_newton import WindowBatch
+from sprung.model.identification.law_forces import LawAlongMotion
 from sprung.model.identification.law_iterate import Iterate, LinearStep
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import as_rows
@@ -31,41 +33,73 @@ _SPLINE_REACH = 12  # samples before a force on which the spline lets it act, by
 
 @dataclass(frozen=True, slots=True)
 class _Responses:
-    """Responses to X = N + T L unit inputs: initial states, then forces at each sample."""
+    """Responses to X = N + T L' unit inputs: initial states, then forces of some of the laws at each sample."""
 
     shown: Tensor  # whitened, of the compressed signals, (X, K)
-    deflection: Tensor  # of the sites, (T, L, X)
+    deflection: Tensor  # of the sites of these laws, (T, L', X)
     rate: Tensor
 
 
 def initial_iterate(w: LawWindows, start: Iterate, data: WindowBatch) -> Iterate:
     """The windows at the values of `start`, with estimated initial states and forces."""
     B, T, L = start.force.shape
-    steps, whiten = _median_model(w, start, data)
-    by = _responses(w, steps, data, whiten)
-    N = len(by.shown) - T * L
-    steps = steps.take(torch.zeros(B, dtype=torch.long))
-    smooth = np.zeros((2, B, T, len(w.system.mechanics.stiffness)))
-    point = replace(start, x0=torch.zeros_like(start.x0), force=torch.zeros_like(start.force))
+    one, whiten = _median_model(w, start, data)
+    steps = one.take(torch.zeros(B, dtype=torch.long))
+    free = _responses(w, one, data, whiten, []).shown
+    point, N = replace(start, x0=torch.zeros_like(start.x0), force=torch.zeros_like(start.force)), len(free)
     residual = w.residual(w.simulate(steps, point.force, point.x0, data)[1], data, whiten)
-    x0, singular = torch.linalg.solve_ex(_regularised(by.shown[:N] @ by.shown[:N].T), by.shown[:N] @ residual)
+    x0, singular = torch.linalg.solve_ex(_regularised(free @ free.T), free @ residual)
     sound = (singular == 0) & x0.isfinite()  # not for absurd values, whose windows start at rest
     point = replace(point, x0=x0.where(sound, 0.0).squeeze(2))
-    products = _regularised(by.shown @ by.shown.T)
-    size = None
-    for error in _ERRORS:
-        states, outputs = w.simulate(steps, point.force, point.x0, data)
-        along = w.along(states, data, smooth, point, steps)
-        law = w.forces_along(along, point, steps)
-        size = law.square().mean(dim=(0, 1)).sqrt().clamp_min(1e-9) if size is None else size
-        squares, pull = _errors(w.slopes_along(along, point, steps), by, point.force - law, (error * size) ** -1)
-        gradient = by.shown @ w.residual(outputs, data, whiten) - pull
-        factor, failed = torch.linalg.cholesky_ex(products + squares)
+    outputs, along, law = _motion(w, steps, point, data)
+    free_to_differ = _stiff(w, steps, point, along, law)
+    followed = [i for i in range(L) if i not in free_to_differ]
+    by = _responses(w, one, data, whiten, free_to_differ)
+    products = _regularised(by.shown @ by.shown.T).expand(B, -1, -1)
+    size = law[..., free_to_differ].square().mean(dim=(0, 1)).sqrt().clamp_min(1e-9)
+    for again, error in enumerate(_ERRORS):
+        if again:
+            outputs, along, law = _motion(w, steps, point, data)
+        if followed:
+            force = point.force.clone()
+            force[..., followed] = law[..., followed]
+            point = replace(point, force=force)
+            outputs, along, law = _motion(w, steps, point, data)
+        gradient, information = by.shown @ w.residual(outputs, data, whiten), products
+        if free_to_differ:
+            slopes = w.slopes_along(along, point, steps)
+            near = slopes[0][..., free_to_differ], slopes[1][..., free_to_differ]
+            squares, pull = _errors(near, by, (point.force - law)[..., free_to_differ], (error * size) ** -1)
+            gradient, information = gradient - pull, products + squares
+        factor, failed = torch.linalg.cholesky_ex(information)
         step = torch.cholesky_solve(gradient, factor).squeeze(2)
         sound = (failed == 0) & step.isfinite().all(dim=1)  # not for absurd signals, whose windows stay as they are
-        step = step.where(sound[:, None], 0.0)
-        point = replace(point, x0=point.x0 + step[:, :N], force=point.force + step[:, N:].view(B, T, L))
+        step, force = step.where(sound[:, None], 0.0), point.force.clone()
+        force[..., free_to_differ] += step[:, N:].view(B, T, len(free_to_differ))
+        point = replace(point, x0=point.x0 + step[:, :N], force=force)
     return point
+
+
+def _motion(
+    w: LawWindows, steps: LinearStep, point: Iterate, data: WindowBatch
+) -> tuple[Tensor, list[LawAlongMotion], Tensor]:
+    """Outputs under the forces of `point`, the laws along that motion and their forces there, (B, T, L)."""
+    states, outputs = w.simulate(steps, point.force, point.x0, data)
+    along = w.along(states, data, np.zeros((2, 1, 1, 1)), point, steps)
+    return outputs, along, w.forces_along(along, point, steps)
+
+
+def _stiff(w: LawWindows, steps: LinearStep, point: Iterate, along: list[LawAlongMotion], law: Tensor) -> list[int]:
+    """Laws whose forces along the linear motion, (B, T, L), are no guide to the true ones: stiffer than their elements
+    somewhere, or of larger forces."""
+    by_deflection = w.slopes_along(along, point, steps)[0].abs().amax(dim=(0, 1))
+    found = []
+    for i, path in enumerate(along):
+        element = w.element(steps, i)
+        own = np.abs(element.stiffness[:, None] * path.d + element.damping[:, None] * path.v).max()
+        if by_deflection[i] > element.stiffness.max() or law[..., i].abs().max() > own:
+            found.append(i)
+    return found
 
 
 def _errors(slopes: tuple[Tensor, Tensor], by: _Responses, off: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
@@ -99,17 +133,18 @@ def _median_model(w: LawWindows, start: Iterate, data: WindowBatch) -> tuple[Lin
     return steps, w.model.whitening(transfer.drive * w.model.drive_noise[:, None])
 
 
-def _responses(w: LawWindows, steps: LinearStep, data: WindowBatch, whiten: Tensor) -> _Responses:
+def _responses(w: LawWindows, steps: LinearStep, data: WindowBatch, whiten: Tensor, laws: list[int]) -> _Responses:
+    """laws: those whose forces are unknown."""
     T, N, L = data.w.shape[1], w.model.states_count, len(w.acting)
-    X = N + T * L
+    X = N + T * len(laws)
     x0, force = torch.eye(X, N, dtype=torch.float64), torch.zeros(X, T, L, dtype=torch.float64)
-    force[N:] = torch.eye(T * L, dtype=torch.float64).view(T * L, T, L)
+    force[N:, :, laws] = torch.eye(T * len(laws), dtype=torch.float64).view(T * len(laws), T, len(laws))
     at_rest = replace(data, w=torch.zeros(X, *data.w.shape[1:], dtype=torch.float64))
     states, outputs = w.simulate(steps.take(torch.zeros(X, dtype=torch.long)), force, x0, at_rest)
     shown = w.model.spectra(outputs @ w.model.compression.matrix(data.present).mT)
     none: FloatArray = np.zeros((2, 1, 1, len(w.system.mechanics.stiffness)))
     d, v = (torch.as_tensor(part).permute(1, 2, 0) for part in w.site_motion(states, at_rest, none))
-    return _Responses(as_rows(whiten @ shown.unsqueeze(3)).squeeze(1), d, v)
+    return _Responses(as_rows(whiten @ shown.unsqueeze(3)).squeeze(1), d[:, laws], v[:, laws])
 
 
 def _regularised(products: Tensor) -> Tensor:

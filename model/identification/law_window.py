@@ -142,7 +142,7 @@ class LawWindows:
         v = (states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T).numpy()
         return d + smooth[0], v + smooth[1]
 
-    def _element(self, steps: LinearStep, law: int) -> SpringDamper:
+    def element(self, steps: LinearStep, law: int) -> SpringDamper:
         """Stiffness and damping that a law sees, each (B,)."""
         at = self.acting[law].element
         return SpringDamper(steps.values.stiffness[:, at].numpy(), steps.values.damping[:, at].numpy())
@@ -227,7 +227,7 @@ class LawWindows:
 
     def _at(self, law: int, point: Iterate, steps: LinearStep) -> tuple[list[FloatArray], SpringDamper, FloatArray]:
         """Values of a law and of its element, that broadcast with (B, fine), and its memory at the first sample."""
-        k, c = self._element(steps, law)
+        k, c = self.element(steps, law)
         values = list(self.values(point, law).T[:, :, None])
         return values, SpringDamper(k[:, None], c[:, None]), self.first_memory(point, law)
 
@@ -428,7 +428,7 @@ class LawWindows:
         at = before + len(names)
         for i, (acting, path) in enumerate(zip(self.acting, along, strict=True)):
             start = self.first_memory(point, i)
-            changes = path.value_sensitivities(self.values(point, i), acting.free, self._element(steps, i), start)
+            changes = path.value_sensitivities(self.values(point, i), acting.free, self.element(steps, i), start)
             for change in changes[:-2]:
                 found[:, :, i, at] = torch.as_tensor(change)
                 at += 1
