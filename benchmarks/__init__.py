@@ -61,6 +61,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "wrong set-ups on simulated recordings: signs, channels, nodes, scales, positions, bodies",
     ),
     "setup-rigs": ("sprung.benchmarks.setup_rigs", "wrong set-ups of rigs that are no train"),
+    "cars": ("sprung.benchmarks.cars", "what cars do that their files leave out"),
     "naming": (
         "sprung.benchmarks.naming",
         "component tests of what rigs do, listed or not: right, unknown, wrong, missed",

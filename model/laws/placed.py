@@ -82,7 +82,7 @@ def _placed(
 ) -> PlacedLaw:
     law = _law(effect, setting, kinds, catalogue)
     numbers = {name: value for name, value in setting.items() if not isinstance(value, str)}
-    if isinstance(law, SensorLaw) and "variant" in setting:
+    if isinstance(law, (SensorLaw, ElementLaw)) and "variant" in setting:
         law = _form(law, str(setting["variant"]))
     if isinstance(law, StructureLaw) and str(setting.get("variant", law.variants[0])) not in law.variants:
         raise ValueError(f"variant: {law.name} has no {setting['variant']!r}; it has {', '.join(law.variants)}")
@@ -150,11 +150,12 @@ def _law(effect: str, setting: LawSetting, kinds: tuple[type, ...], catalogue: S
     )
 
 
-def _form(law: SensorLaw, variant: str) -> SensorLaw:
-    if variant not in law.forms:
-        known = f"it has {', '.join(law.forms)}" if law.forms else "it has none"
+def _form(law: SensorLaw | ElementLaw, variant: str) -> SensorLaw | ElementLaw:
+    forms = dict(law.forms)
+    if variant not in forms:
+        known = f"it has {', '.join(forms)}" if forms else "it has none"
         raise ValueError(f"variant: {law.name} has no {variant!r}; {known}")
-    return law.forms[variant]
+    return forms[variant]
 
 
 def _location(file: SystemFile, law: Law, location: str, setting: LawSetting) -> str:

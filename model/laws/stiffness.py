@@ -125,6 +125,46 @@ BUMP_STOP = with_wider_form(
 )
 
 
+def _extension_stop(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    gap, stiffness = p
+    found: FloatArray = stiffness * np.maximum(motion.deflection - gap, 0.0)
+    return found
+
+
+def _compression_stop(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    gap, stiffness = p
+    found: FloatArray = stiffness * np.minimum(motion.deflection + gap, 0.0)
+    return found
+
+
+# Of cars most stops act in compression alone
+BUMP_STOP = replace(
+    BUMP_STOP,
+    forms=(
+        (
+            "extension",
+            replace(
+                _BUMP_STOP,
+                force=_extension_stop,
+                formula="stiffness * max(d - gap, 0)",
+                sentence="a stop of {stiffness} is touched beyond {gap} of extension",
+                one_sided=True,
+            ),
+        ),
+        (
+            "compression",
+            replace(
+                _BUMP_STOP,
+                force=_compression_stop,
+                formula="stiffness * min(d + gap, 0)",
+                sentence="a stop of {stiffness} is touched beyond {gap} of compression",
+                one_sided=True,
+            ),
+        ),
+    ),
+)
+
+
 def _progressive_stop(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     gap, stiffness, gap_compression, stiffness_compression, exponent = p
     d = motion.deflection

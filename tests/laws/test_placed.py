@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from sprung.model.identification.estimator import bundled_estimator
-from sprung.model.laws import ElementLaw
+from sprung.model.laws import ElementLaw, Motion, SpringDamper
 from sprung.model.schema import SystemFileError
 from sprung.model.system import System, load_system, parse_system
 
@@ -40,6 +41,15 @@ def test_laws_are_placed_with_values_and_deviations() -> None:
     assert (law.std, law.fixed) == ((2.0, None), (False, True))
     assert law.names == ("strut.coulomb_friction.force", "strut.coulomb_friction.smoothing")
     assert (bias.location, bias.values) == ("car_a", (0.1,))
+
+
+def test_a_form_of_a_law_is_asked_for_by_its_variant() -> None:
+    (stop,) = system(", laws: [{bump_stop: {gap: 0.02, stiffness: 1.0e5, variant: compression}}]").laws
+    assert isinstance(stop.law, ElementLaw) and (stop.law.name, stop.variant) == ("bump_stop", "compression")
+    force = stop.law.force(Motion(np.array([-0.03, 0.0, 0.03]), 0.0), stop.values, SpringDamper(2e4, 1500.0))
+    np.testing.assert_allclose(force, [-1e3, 0.0, 0.0])
+    with pytest.raises(SystemFileError, match="bump_stop has no 'up'; it has extension, compression"):
+        system(", laws: [{bump_stop: {gap: 0.02, stiffness: 1.0e5, variant: up}}]")
 
 
 def test_a_formula_is_a_law() -> None:

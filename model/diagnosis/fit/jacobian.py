@@ -17,7 +17,7 @@ from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.motion import Motions, motions_of
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import evaluated_in_time
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.laws import SensorLaw
 from sprung.model.signals import FloatArray
 
@@ -90,6 +90,18 @@ class Linearised:
         if self.forces is not None:
             _add_laws_answers(known, problem, working.whitener, self.forward, self.forces, self.free.shape[2])
         return known
+
+
+def sensitivity_to(problem: Problem, point: Point, whitener: Whitener, term: Term) -> FloatArray:
+    """Whitened change of the model by the first parameter of a term beside those of a point, (R,).
+
+    By a finite difference of the whole model, so that it contains the reaction of the point's laws.
+    """
+    working = Working(whitener)
+    shown, forward, forces = problem.predict(point, working.inputs, working.plant)
+    beside = replace(point, terms=(*point.terms, term))
+    change = _difference(problem, beside, working, (len(point.terms), 0), forward, forces, shown)
+    return whitener(change.shown, problem.part)
 
 
 @dataclass

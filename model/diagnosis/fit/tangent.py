@@ -31,10 +31,10 @@ def law_change(forward: Forward, forces: LawForces, term: Term, parameter: int) 
     port = forces.index(term)
     if isinstance(term.law, StaticLaw):
         values = term.law.values(forces.deflection[:, port], forces.rate[:, port])
-        return port, forward.part.grid.coarse_spectrum(values[parameter])
+        return port, forward.part.grid.coarse_forces(values[parameter])
     step = step_of(term, parameter)
     change = (law_force(forward, term.moved(parameter, step), forces) - law_force(forward, term, forces)) / step
-    return port, forward.part.grid.coarse_spectrum(change)
+    return port, forward.part.grid.coarse_forces(change)
 
 
 def port_motions(

@@ -62,7 +62,7 @@ def without_last_term(problem: Problem, fit: Fit) -> Fit:
     """A fit whose last term, a force along an element, is left in its motion and is missing in its residual."""
     point, term = fit.point, fit.point.terms[-1]
     projector = Projector(problem, fit)
-    spectrum = projector.grid.coarse_spectrum(fit.force_along(term))[projector.grid.band]
+    spectrum = projector.grid.coarse_forces(fit.force_along(term))[projector.grid.band]
     residual = fit.residual + projector.seen_of(term.port(problem.system), spectrum)
     own = np.zeros(fit.jacobian.shape[1], dtype=bool)
     own[fit.place(len(point.terms) - 1)] = True

@@ -9,6 +9,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.judgement import is_part, leaves_more_than_noise
 from sprung.model.diagnosis.investigation.state import Investigation
+from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.compete import Trial
@@ -32,11 +33,17 @@ def untried(state: Investigation, candidates: Iterable[Candidate]) -> list[Candi
 def _repeats(state: Investigation, candidate: Candidate) -> bool:
     """Whether a candidate is a law that was found at its place, or any law where an unnamed force was found."""
     for term in state.fit.point.terms:
-        if candidate.term.key[:2] == term.key[:2]:
+        if candidate.term.key[:2] == term.key[:2] and not _are_two_sides(candidate.term, term):
             return True
         if candidate.location == term.location and not term.law.listed:
             return True
     return False
+
+
+def _are_two_sides(one: Term, other: Term) -> bool:
+    """Whether two terms of a law act in the two directions of a deflection."""
+    sided = all(isinstance(term.law, ElementLaw) and term.law.one_sided for term in (one, other))
+    return sided and one.variant != other.variant
 
 
 def _hopeless(state: Investigation, candidate: Candidate) -> bool:

@@ -76,5 +76,5 @@ def _forces(problem: Problem, fit: Fit) -> FloatArray:
         element, thin = fit.forward.element_at(name), slice(None, None, OVERSAMPLING)
         seen = observe(d[thin], v[thin], 1 / projector.grid.step, float(element.stiffness), float(element.damping))
         values = np.array(static_law(trials()["map"], seen).values(d, v))
-        found += [projector.seen_of(port, force) for force in projector.grid.compared_spectra(values)]
+        found += [projector.seen_of(port, force) for force in projector.grid.compared_forces(values)]
     return np.column_stack(found)

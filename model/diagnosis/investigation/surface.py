@@ -38,7 +38,7 @@ def _estimate(problem: Problem, fit: Fit) -> LatentForce:
     present = fit.force_along(term)
 
     def respond(forces: FloatArray) -> FloatArray:
-        spectra = grid.coarse_spectrum(forces)[grid.band]  # (F, m)
+        spectra = grid.coarse_forces(forces)[grid.band]  # (F, m)
         answers = [projector.pack(projector.of_force[:, :, element] * column[:, None]) for column in spectra.T]
         return np.stack(answers, axis=1)
 

@@ -291,7 +291,7 @@ def _by_role(
         force=np.column_stack(inputs.force) if inputs.force else empty,
         sensors=sensors[:, present],
         sensor_index=np.flatnonzero(present),
-        sensor_names=tuple(np.array(system.sensors)[present]),
+        sensor_names=tuple(np.array(system.sensors)[present].tolist()),
         support_names=tuple(inputs.support_names),
         force_names=tuple(inputs.force_names),
         integrated=np.array(inputs.integrated, dtype=bool),

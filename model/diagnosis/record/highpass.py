@@ -1,8 +1,10 @@
 """High-pass filter for recordings whose supports are measured by acceleration alone.
 
 Over a recording, integrated acceleration noise drifts by metres.  Filtering all signals alike preserves their linear
-relation, so everything well below the slowest mode is removed: there bodies follow their supports, elements hardly
-deflect, and nothing is identifiable.  Transients of the filter at both ends are cut off.
+relation, and forces of nonlinear laws are filtered as well (`Grid.let_through`): a damper that is harder in extension
+pulls the body down slowly, which filtered signals do not show.  So everything well below the slowest mode is removed:
+there bodies follow their supports, elements hardly deflect, and nothing is identifiable.  Transients of the filter at
+both ends are cut off.
 """
 
 from __future__ import annotations
@@ -13,13 +15,12 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.record.spectra import HIGH_PASS_ORDER
 from sprung.model.diagnosis.rules import RecordRules
 from sprung.model.mechanics import DISPLACEMENT, VELOCITY
 from sprung.model.schema import GROUND, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
-
-_ORDER = 4  # of the filter, which runs forwards and backwards
 
 
 def carries_everything(system: System, support: str) -> bool:
@@ -42,7 +43,7 @@ def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signal
         return signals, 0.0
     edge = rules.passed * slowest_mode(system, rules.held)
     cut = round(rules.settled / edge * signals.sample_rate)
-    filtered = butter(_ORDER, edge, "highpass", fs=signals.sample_rate, output="sos")
+    filtered = butter(HIGH_PASS_ORDER, edge, "highpass", fs=signals.sample_rate, output="sos")
 
     def high(series: FloatArray) -> FloatArray:
         known = np.isfinite(series[0]) if series.shape[1] else np.zeros(0, dtype=bool)
@@ -58,5 +59,6 @@ def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signal
         force=high(signals.force),
         sensors=high(signals.sensors),
         fused=(),
+        edge=edge,
     )
     return whole.part(cut, max(signals.samples - cut, cut)), edge

@@ -57,6 +57,7 @@ class Signals:
     start: float = 0.0  # s, time of the first sample since the start of the recording
     speed: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # m/s, on a track, where measured, (T, 0 or 1)
     averaged: int = 1  # samples as they were recorded in every one of these
+    edge: float = 0.0  # Hz, of the high-pass filter that they have passed; 0: none
     fused: tuple[FusedMotion, ...] = ()  # of the supports whose acceleration is measured beside something else
 
     @property
@@ -257,7 +258,7 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
 
     `differentiated`: sensors whose series are compared by their rates (`drifting`), (S,).
     """
-    grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start)
+    grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start, signals.edge)
     differentiated = np.zeros(signals.sensors.shape[1], dtype=bool) if differentiated is None else differentiated
     sensors = signals.sensors
     if differentiated.any():

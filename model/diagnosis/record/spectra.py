@@ -27,6 +27,16 @@ OVERSAMPLING = 4  # laws with kinks make harmonics beyond the Nyquist frequency 
 BAND = 0.30  # of the sample rate: above it anti-alias filters attenuate
 
 
+HIGH_PASS_ORDER = 4  # Butterworth, run forwards and backwards
+
+
+def high_pass_gain(ratio: FloatArray) -> FloatArray:
+    """Gain at frequencies in units of the edge: a Butterworth filter's, squared."""
+    power = np.abs(ratio) ** (2 * HIGH_PASS_ORDER)
+    gain: FloatArray = power / (1 + power)
+    return gain
+
+
 @dataclass(frozen=True)
 class Grid:
     """The time and frequency grid of one record part: N samples every `step` seconds."""
@@ -34,6 +44,7 @@ class Grid:
     samples: int
     step: float
     start: float = 0.0  # s, time of the first sample of this part since the start of the recording
+    edge: float = 0.0  # Hz, of the high-pass filter that all signals have passed (`highpass`); 0: none
 
     @cached_property
     def omega(self) -> FloatArray:
@@ -103,11 +114,21 @@ class Grid:
         )
         return found
 
-    def coarse_spectrum(self, fine_series: FloatArray) -> ComplexArray:
-        """Transform of an oversampled series, kept up to the record's Nyquist frequency."""
+    def let_through(self, omega: FloatArray) -> FloatArray:
+        """Gain of the signals' high-pass filter at frequencies (rad/s); 1 without one."""
+        if not self.edge:
+            return np.ones_like(omega)
+        return high_pass_gain(omega / (2 * np.pi * self.edge))
+
+    def coarse_forces(self, fine_series: FloatArray) -> ComplexArray:
+        """Transform of oversampled forces of laws, kept up to the record's Nyquist frequency, as far as they show."""
         full = scipy.fft.rfft(fine_series, axis=0)
         found: ComplexArray = full[: len(self.omega)] / (OVERSAMPLING * np.sqrt(self.samples))
-        return found
+        return found * self.let_through(self.omega).reshape((-1,) + (1,) * (found.ndim - 1))
+
+    def compared_forces(self, fine_series: FloatArray) -> ComplexArray:
+        """Compared bins of oversampled forces of laws, (m, OVERSAMPLING N) -> (m, compared bins), as they show."""
+        return self.compared_spectra(fine_series) * self.let_through(self.omega[self.band])
 
     def compared_spectra(self, fine_series: FloatArray) -> ComplexArray:
         """Compared bins of oversampled series, (m, OVERSAMPLING N) -> (m, compared bins), in one transform."""

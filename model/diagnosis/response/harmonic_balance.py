@@ -140,13 +140,17 @@ class HarmonicBalance:
     def decompose(self, force: FloatArray) -> tuple[ComplexArray, FloatArray]:
         """Periodic spectrum on the oversampled axis' bins, (2N + 1, m), and polynomial, (DEGREE + 1, m).
 
-        The polynomial consists of the line through both ends and the mean of the remainder.
+        The polynomial consists of the line through both ends and the mean of the remainder.  Of records behind a
+        high-pass filter only what that lets through counts, and no polynomial.
         """
         line = np.zeros((DEGREE + 1, force.shape[1]))
         line[1] = force[-1] - force[0]
         rest = force - self.powers[:, 1:2] * line[1]
         line[0] = rest.mean(axis=0)
-        return rfft(rest - line[0], axis=0), line
+        spectrum = rfft(rest - line[0], axis=0)
+        if self.grid.edge:
+            return spectrum * self.grid.let_through(np.abs(self.jw))[:, None], np.zeros_like(line)
+        return spectrum, line
 
     def motion(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflection and rate along the ports under forces (4N, m), each (4N, m)."""

@@ -63,7 +63,7 @@ class TrialElement:
                 force_along(term.element_law, term.parameters, self.deflection, self.rate, time, self.element)
                 for term in terms
             ]
-            return grid.compared_spectra(np.array(forces))
+            return grid.compared_forces(np.array(forces))
         return np.array([self._of_branch(term) for term in terms])
 
     def _of_branch(self, term: Term) -> ComplexArray:
@@ -83,6 +83,7 @@ def element_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[
     system = projector.problem.system
     asked = [(law, "") for law in laws if isinstance(law, ElementLaw) and law.screened]
     asked += [(law.wider, WIDER) for law, _ in asked if law.wider is not None and law.wider.screened]
+    asked += [(form, variant) for law, _ in asked for variant, form in law.forms]
     candidates = [Term(law, at, law.absent, variant) for law, variant in asked for at in places(system, law)]
     ports = {absent.location: absent.port(system) for absent in candidates}
     elements = {location: TrialElement.along(projector, location, port) for location, port in ports.items()}
@@ -122,7 +123,7 @@ def _unnamed(motion: TrialElement) -> Iterator[tuple[Candidate, int]]:
         law = static_law(basis, motion.seen)
         scales = tuple(q.typical(motion.seen) for q in law.parameters)
         values = np.array(law.values(motion.deflection, motion.rate))
-        score, amplitudes = motion.channel.joint(motion.projector.grid.compared_spectra(values))
+        score, amplitudes = motion.channel.joint(motion.projector.grid.compared_forces(values))
         term = Term(law, motion.location, tuple(float(a) for a in amplitudes), name, scales=scales)
         yield Candidate(term, score, UNNAMED), 1
 
