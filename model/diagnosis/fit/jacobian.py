@@ -17,7 +17,7 @@ from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.motion import Motions, motions_of
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
+from sprung.model.diagnosis.response.terms import evaluated_in_time
 from sprung.model.laws import SensorLaw
 from sprung.model.signals import FloatArray
 
@@ -92,16 +92,25 @@ class Linearised:
         return known
 
 
-def sensitivity_to(problem: Problem, point: Point, whitener: Whitener, term: Term) -> FloatArray:
-    """Whitened change of the model by the first parameter of a term beside those of a point, (R,).
+def sensitivity_to_load(
+    problem: Problem, forward: Forward, forces: LawForces, whitener: Whitener, load: ComplexArray
+) -> FloatArray:
+    """Whitened response to a load (F, n) on the degrees of freedom, with the reaction of the laws, (R,).
 
-    By a finite difference of the whole model, so that it contains the reaction of the point's laws.
+    To the same approximation as the columns of a fit: a load that they can imitate leaves nothing beside them.
     """
-    working = Working(whitener)
-    shown, forward, forces = problem.predict(point, working.inputs, working.plant)
-    beside = replace(point, terms=(*point.terms, term))
-    change = _difference(problem, beside, working, (len(point.terms), 0), forward, forces, shown)
-    return whitener(change.shown, problem.part)
+    parameters, states = len(forward.system.parameters), forward.plant.structure.states
+    bins = len(forward.part.grid.omega)
+    known = _Sensitivities(
+        JacobianColumns(forward, whitener, parameters + 1 + states),
+        np.zeros((bins, parameters), dtype=complex),
+        {parameters: load},
+        np.zeros((bins, 1, len(forces.terms)), dtype=complex),
+        np.zeros(parameters + 1),
+    )
+    known.packed.add_load(parameters, load)
+    _add_laws_answers(known, problem, whitener, forward, forces, states)
+    return known.packed.jacobian[:, parameters]
 
 
 @dataclass

@@ -37,6 +37,7 @@ _EVEN, _EMPTY = 1.8, 0.2  # of power, within which bands are even and below whic
 _SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
 _END_DEGREE = 4  # of the polynomial through them, of a support's motion
+_INTEGRATED_DEGREE = 7  # the same of an integrated acceleration, whose fast noise is small, and fast motion is not
 
 
 @dataclass(frozen=True)
@@ -268,7 +269,8 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
     d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
     polynomial = np.zeros((grid.monomials.shape[1], d.shape[1]))
     if d.shape[1]:
-        slopes = _end_slopes(d, grid, _END_DEGREE)
+        plain, integrated_slopes = (_end_slopes(d, grid, degree) for degree in (_END_DEGREE, _INTEGRATED_DEGREE))
+        slopes = [np.where(signals.accelerated, *pair) for pair in zip(integrated_slopes, plain, strict=True)]
         first, last = (np.where(has_rate, v[at], slope) for at, slope in zip((0, -1), slopes, strict=True))
         polynomial = detrend_ends(d, (first, last), grid)
     slope = np.zeros_like(polynomial)

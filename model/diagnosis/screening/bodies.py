@@ -11,15 +11,17 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.ndimage import median_filter
 
-from sprung.model.diagnosis.fit.jacobian import sensitivity_to
+from sprung.model.diagnosis.fit.jacobian import sensitivity_to_load
 from sprung.model.diagnosis.response.forward import structure_of
-from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
+from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ScreeningRules
 from sprung.model.diagnosis.screening.families import LINE, MASS, MODE
 from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
 from sprung.model.mechanics import ACCELERATION, VELOCITY
 from sprung.model.signals import FloatArray
+
+_TANGENT = 0.02  # relative error of columns with the reaction of laws, whose slopes are taken from sample to sample
 
 
 def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
@@ -39,26 +41,21 @@ def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tup
 
 
 def _mass(projector: Projector, law: BodyLaw, index: int, name: str) -> Candidate:
-    """Another mass of a body; beside laws with their reaction, since stiffness and damping absorb most of it."""
-    fit, problem = projector.fit, projector.problem
-    nothing = Term(law, name, law.absent, scales=(0.1,))
-    if any(evaluated_in_time(term) for term in fit.point.terms) and not problem.process_noise:
-        score, amplitude = projector.score(sensitivity_to(problem, fit.point, fit.whitener, nothing))
-    else:
-        score, amplitude = _mass_alone(projector, index)
-    ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
-    return Candidate(nothing.at(np.array([ratio])), score, MASS)
-
-
-def _mass_alone(projector: Projector, index: int) -> tuple[float, float]:
-    """Score and relative change of a body's mass in a linear structure."""
+    """Another mass of a body; stiffness and damping absorb most of it, so that the laws' reaction counts."""
     fit, grid = projector.fit, projector.grid
     structure = fit.forward.plant.structure
     dofs = structure.body_of_dof == index
-    load = np.where(dofs, -structure.mass * fit.motions.acceleration, 0.0)[grid.band]
-    column = projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load))
-    spread = projector.spread(column, fit.forward.inputs_by_mass(dofs)[grid.band])
-    return projector.score(column, (spread, 0.0))
+    load = np.where(dofs, -structure.mass * fit.motions.acceleration, 0.0)
+    if fit.forces is not None and not projector.problem.process_noise:
+        column = sensitivity_to_load(projector.problem, fit.forward, fit.forces, fit.whitener, load)
+        score, amplitude = projector.score(column, least=_TANGENT**2)
+    else:
+        column = projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load[grid.band]))
+        spread = projector.spread(column, fit.forward.inputs_by_mass(dofs)[grid.band])
+        score, amplitude = projector.score(column, (spread, 0.0))
+    ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
+    term = Term(law, name, (ratio,), variant="", scales=(0.1,))
+    return Candidate(term, score, MASS)
 
 
 def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterator[tuple[Candidate, int]]:

@@ -23,6 +23,8 @@ from sprung.model.diagnosis.rules import RULES, ScreeningRules
 from sprung.model.diagnosis.screening.families import Family
 from sprung.model.signals import FloatArray
 
+_ROUNDING = 1e-7
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -151,14 +153,20 @@ class Projector:
         """Reduction of the residual by a force (F,) along a port, (2 F S,)."""
         return self.pack(self.of_port(port) * force[:, None])
 
-    def score(self, column: FloatArray, more: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
-        """Statistic and amplitude of a column; `more`: the same of residuals outside the sensors (product, square)."""
+    def score(
+        self, column: FloatArray, more: tuple[float, float] = (0.0, 0.0), least: float = _ROUNDING
+    ) -> tuple[float, float]:
+        """Statistic and amplitude of a column.
+
+        more: the same of residuals outside the sensors (product, square); least: share of the column's square that
+        the projection has to leave, as much as an error of the columns would leave of one that they can imitate.
+        """
         inside = self.q.T @ column
         size = float(column @ column)
         left = size - float(inside @ inside)
-        if left <= 1e-7 * size and more[1] <= 0:
+        if left <= least * size and more[1] <= 0:
             return 0.0, 0.0
-        left = max(left, 1e-7 * size) + more[1]
+        left = max(left, least * size) + more[1]
         product = float(column @ self.residual) + more[0]
         return product**2 / left, product / left
 

@@ -90,18 +90,26 @@ def displaced_spring(before: Fit, fit: Fit, term: Term, rules: PlausibleRules = 
 
 
 def hardly_there(fit: Fit, rules: PlausibleRules = RULES.plausible, index: int = -1) -> bool:
-    """Whether a term with one parameter does not differ significantly from its absence; by default the last term.
+    """Whether a term does not differ significantly from its absence; by default the last term.
 
-    Of other terms: never.
+    Of one with several parameters: whether none of them is determined.
     """
     term = fit.point.terms[index]
     if len(term.parameters) != 1:
-        return False
+        return term.law.named and _undetermined(fit, index)
     value, at = term.parameters[0], fit.place(index).start
     stated = np.hypot(np.sqrt(max(fit.covariance[at, at], 0.0)), rules.simulated * abs(value))
     if not np.isfinite(term.law.absent[0]):  # the inverse vanishes: a rigid connection has no compliance
         return bool(abs(value) < rules.apart * stated)
     return bool(abs(value - term.law.absent[0]) < rules.apart * stated)
+
+
+def _undetermined(fit: Fit, index: int) -> bool:
+    """Whether the standard deviation of every parameter of a term exceeds its value."""
+    term, place = fit.point.terms[index], fit.place(index)
+    spread = np.sqrt(np.maximum(np.diag(fit.covariance)[place], 0.0))
+    determined = spread <= np.abs(term.parameters)  # not of what is not finite
+    return not bool(np.any(determined))
 
 
 def _saturates(fit: Fit, term: Term, rules: PlausibleRules) -> bool:
