@@ -87,9 +87,8 @@ def test_the_force_of_a_law_passes_the_filter_that_all_signals_passed() -> None:
 def test_a_car_without_effect_has_the_noise_that_is_declared_at_every_sensor() -> None:
     # the slopes of integrated accelerations at the ends of the record must not show as noise
     one = effect(cars.HUBS, "")
-    system, _ = cars.recorded(one, np.random.default_rng(3), 5.0)
-    problem, _ = fitted(one, seconds=40.0)
-    declared = np.array([channel.noise for channel in system.channels][2:]) / np.sqrt(
-        2
-    )  # every second sample, averaged
-    np.testing.assert_allclose(problem.noise.sensors, declared, rtol=0.08)
+    system, values = cars.recorded(one, np.random.default_rng([61107, 4]), 50.0)
+    signals = prepare(system, values, system.sample_rate).signals
+    declared = declared_noise(system, signals)
+    problem, _ = baseline(system, signals, declared, int(0.7 * signals.samples))
+    np.testing.assert_allclose(problem.noise.sensors, declared.sensors, rtol=0.08)
