@@ -49,16 +49,17 @@ class JacobianColumns:
         plant = self.forward.plant
         if plant.floats:
             rest, line = plant.without_line(force[:, None])
-            motion = np.einsum("k,kpn->pn", line[:, 0], plant.line_motion(np.eye(len(plant.structure.H))[element]))
-            self._add_polynomial(column, motion)
+            unit = np.eye(len(plant.structure.H))[element]
+            motion = np.einsum("k,kpn->pn", line[:, 0], plant.line_motion(unit))
+            self._add_polynomial(column, motion, line_load(line) * unit)
             force = rest[:, 0]
         self._add(column, self.of_force[element] * force[self.band, None])
 
-    def _add_polynomial(self, column: int, motion: FloatArray) -> None:
-        """Shown sensor signals of a polynomial motion."""
+    def _add_polynomial(self, column: int, motion: FloatArray, force: FloatArray | float = 0.0) -> None:
+        """Shown sensor signals of a polynomial motion, and of a polynomial force along the elements."""
         plant = self.forward.plant
         still = np.zeros((motion.shape[0], plant.structure.G.shape[1]))
-        seen = plant.grid.monomial_spectra @ plant.polynomial_sensors(motion, still)
+        seen = plant.grid.monomial_spectra @ plant.polynomial_sensors(motion, still, force)
         self.add_shown(column, seen * self.forward.sensor_factor)
 
     def add_port(self, column: int, port: FloatArray, force: ComplexArray) -> None:

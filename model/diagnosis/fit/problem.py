@@ -86,7 +86,8 @@ class Problem:
             periodic = periodic + self._of_input_noise(forward)
         if forces is not None:
             periodic = periodic + forces.sensors
-            polynomial = polynomial + plant.polynomial_sensors(forces.motion, np.zeros_like(part.support_polynomial))
+            still = np.zeros_like(part.support_polynomial)
+            polynomial = polynomial + plant.polynomial_sensors(forces.motion, still, forces.line)
         return forward.shown(periodic, polynomial) + forward.of_body_loads()
 
     def shown_of_smoothed(self, forward: Forward, spectrum: ComplexArray) -> ComplexArray:

@@ -214,14 +214,18 @@ class Plant:
         inverse = np.linalg.pinv(system * columns / scale[:, None], rcond=1e-13)
         return np.asarray(columns[:, None] * inverse / scale)
 
-    def polynomial_sensors(self, q: FloatArray, support: FloatArray) -> FloatArray:
-        """Sensor polynomials from motion (DEGREE + 1, n) and supports (DEGREE + 1, supports): (DEGREE + 1, S)."""
+    def polynomial_sensors(self, q: FloatArray, support: FloatArray, law: FloatArray | float = 0.0) -> FloatArray:
+        """Sensor polynomials, (DEGREE + 1, S).
+
+        From motion (DEGREE + 1, n), supports (DEGREE + 1, supports), and forces of laws along the elements
+        (DEGREE + 1, E), which load cells show directly.
+        """
         s = self.structure
         q1, d = self.derivative(q), q @ s.H.T + support @ s.G.T
         kind = s.sensor_kind
         result = np.where(kind == ACCELERATION, self.derivative(q1) @ s.S.T, 0.0)
         result += np.where(kind == VELOCITY, q1 @ s.S.T, 0.0) + np.where(kind == DISPLACEMENT, q @ s.S.T, 0.0)
-        force = d * s.stiffness + self.derivative(d) * s.steady_damping
+        force = d * s.stiffness + self.derivative(d) * s.steady_damping + law
         result += np.where(kind == DEFLECTION, d @ s.L.T, 0.0) + np.where(kind == FORCE, force @ s.L.T, 0.0)
         return result
 

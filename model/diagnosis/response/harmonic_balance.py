@@ -44,6 +44,7 @@ class LawForces:
     deflections: ComplexArray  # response of the deflections, periodic part, (F, E)
     q: ComplexArray  # response of the degrees of freedom, periodic part, (F, n)
     motion: FloatArray  # polynomial response, (DEGREE + 1, n)
+    line: FloatArray  # polynomial part of the forces along the elements, (DEGREE + 1, E)
     evaluations: int = 0  # of a law over the whole record, until the solution
 
     def index(self, term: Term) -> int:
@@ -117,7 +118,18 @@ class HarmonicBalance:
         q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (self.wide @ plant.structure.H))
         deflections = q @ plant.structure.H.T
         return LawForces(
-            self.terms, self.ports, d, v, force, converged, sensors, deflections, q, motion, self.evaluations
+            self.terms,
+            self.ports,
+            d,
+            v,
+            force,
+            converged,
+            sensors,
+            deflections,
+            q,
+            motion,
+            line @ self.wide,
+            self.evaluations,
         )
 
     def _compliance(self, ports: FloatArray) -> ComplexArray:

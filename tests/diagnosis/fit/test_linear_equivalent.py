@@ -26,7 +26,7 @@ def along_a_sine(term: Term) -> tuple[float, float]:
     d, v = SIZE * np.sin(OMEGA * time)[:, None], SIZE * OMEGA * np.cos(OMEGA * time)[:, None]
     none = np.zeros((1, 1), dtype=complex)
     port = term.port(PROBLEM.system)[None]
-    forces = LawForces([term], port, d, v, np.zeros_like(d), True, none, none, none, np.zeros((1, 1)))
+    forces = LawForces([term], port, d, v, np.zeros_like(d), True, none, none, none, np.zeros((1, 1)), np.zeros((1, 1)))
     return _equivalent(forward, forces, term)
 
 

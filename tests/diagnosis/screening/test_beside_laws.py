@@ -92,3 +92,12 @@ def test_a_car_without_effect_has_the_noise_that_is_declared_at_every_sensor() -
     declared = declared_noise(system, signals)
     problem, _ = baseline(system, signals, declared, int(0.7 * signals.samples))
     np.testing.assert_allclose(problem.noise.sensors, declared.sensors, rtol=0.08)
+
+
+def test_a_load_cell_shows_the_mean_of_a_law_that_its_element_has() -> None:
+    one = effect(cars.QUARTER, "damper_asymmetry")
+    problem, fit = fitted(one, as_system(with_its_law(one)))
+    cell = problem.part.sensors[0, list(problem.system.sensors).index("load")]
+    mean_of_law = fit.forces.force.mean() * np.sqrt(problem.part.grid.samples) if fit.forces is not None else 0.0
+    assert abs(mean_of_law) > 20 * abs(cell)  # beside it the spring's, so that the sum is none
+    assert fit.reduced < 1.15
