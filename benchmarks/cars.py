@@ -17,14 +17,15 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from sprung.benchmarks.setup_rigs import FINER, SPREAD, SYSTEMS, RigRecord, interpolated
+from sprung.benchmarks.setup_rigs import FINER, SPREAD, SYSTEMS, RigRecord, in_band, interpolated
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System, load_system, parse_system
 
 Array = NDArray[np.float64]
 MASSES, GAINS = 0.04, 0.003  # standard deviations of masses and gains from the file's, relative
-_ROUGH = 2.5e-3  # m, rms of the road above 0.3 Hz, times the square root of 10
+_BAND, _ROUGH = (0.3, 25.0), 2.5e-3 * np.sqrt(10)  # of the road: Hz, and rms in m
+_HUB = 69.0  # rad/s, of an unsprung mass on its tyre
 
 
 @dataclass(frozen=True)
@@ -106,21 +107,16 @@ def _actual(effect: Effect, random: np.random.Generator) -> dict[str, Any]:
 def _driven(file: str, samples: int, rate: float, random: np.random.Generator) -> Array:
     """Input columns (T, C): road and its rate, or accelerations of two hubs 0.12 s apart."""
     omega = 2j * np.pi * np.fft.rfftfreq(samples, 1 / rate)
-    road = _road(samples, rate, random)
-    spectrum = np.fft.rfft(road)
+    tyre = 1 + 0.5 * omega / _HUB + (omega / _HUB) ** 2
+
+    def road() -> Array:
+        return in_band(samples, rate, _BAND, _ROUGH, random, slope=-1.0)
+
+    def hub() -> Array:
+        return np.asarray(np.fft.irfft(np.fft.rfft(road()) / tyre * omega**2, samples))
+
     if file == QUARTER:
-        return np.column_stack([road, np.fft.irfft(spectrum * omega, samples)])
-    hub = spectrum / (1 + 0.5 * omega / 69 + (omega / 69) ** 2)  # an unsprung mass on its tyre, 11 Hz
-    front = np.fft.irfft(hub * omega**2, samples)
-    other = np.fft.rfft(_road(samples, rate, random)) / (1 + 0.5 * omega / 69 + (omega / 69) ** 2)
-    rear = 0.95 * np.roll(front, round(0.12 * rate)) + 0.3 * np.fft.irfft(other * omega**2, samples)
-    return np.column_stack([front, rear])
-
-
-def _road(samples: int, rate: float, random: np.random.Generator) -> Array:
-    """Height (T,) with the spectrum of a road, its amplitude falling with the frequency, from 0.3 to 25 Hz."""
-    frequency = np.fft.rfftfreq(samples, 1 / rate)
-    inside = (frequency > 0.3) & (frequency < 25.0)
-    shape = np.where(inside, 1 / np.maximum(frequency, 0.3), 0.0)
-    series = np.fft.irfft(np.fft.rfft(random.standard_normal(samples)) * shape, samples)
-    return np.asarray(series * np.sqrt(10) * _ROUGH / np.std(series))
+        height = road()
+        return np.column_stack([height, np.fft.irfft(np.fft.rfft(height) * omega, samples)])
+    front = hub()
+    return np.column_stack([front, 0.95 * np.roll(front, round(0.12 * rate)) + 0.3 * hub()])

@@ -112,7 +112,7 @@ def interpolated(series: Array) -> Array:
     return np.asarray(FINER * np.fft.irfft(spectrum, len(series) * FINER, axis=0))
 
 
-def _in_band(
+def in_band(
     samples: int, rate: float, band: tuple[float, float], rms: float, random: np.random.Generator, slope: float = 0.0
 ) -> Array:
     """Random series (T,) whose amplitude goes with frequency to the power of `slope` within a band, Hz."""
@@ -125,19 +125,19 @@ def _in_band(
 
 def _roads(samples: int, rate: float, random: np.random.Generator) -> Array:
     """Displacement and velocity below two axles 4 m apart at 20 m/s, partly of their own, (T, 4)."""
-    front = _in_band(samples, rate, (0.3, 20.0), 0.006, random, -1.5)
-    rear = 0.9 * np.roll(front, round(0.2 * rate)) + _in_band(samples, rate, (0.3, 20.0), 0.003, random, -1.5)
+    front = in_band(samples, rate, (0.3, 20.0), 0.006, random, -1.5)
+    rear = 0.9 * np.roll(front, round(0.2 * rate)) + in_band(samples, rate, (0.3, 20.0), 0.003, random, -1.5)
     omega = 2j * np.pi * np.fft.rfftfreq(samples, 1 / rate)
     velocity = [np.fft.irfft(np.fft.rfft(road) * omega, samples) for road in (front, rear)]
     return np.column_stack([front, velocity[0], rear, velocity[1]])
 
 
 def _table(samples: int, rate: float, random: np.random.Generator) -> Array:
-    return _in_band(samples, rate, (0.3, 20.0), 1.5, random)[:, None]
+    return in_band(samples, rate, (0.3, 20.0), 1.5, random)[:, None]
 
 
 def _shaker(samples: int, rate: float, random: np.random.Generator) -> Array:
-    return _in_band(samples, rate, (1.0, 60.0), 300.0, random)[:, None]
+    return in_band(samples, rate, (1.0, 60.0), 300.0, random)[:, None]
 
 
 _FRONT = ("road_front.displacement", "road_front.velocity")

@@ -92,25 +92,26 @@ class Linearised:
         return known
 
 
-def sensitivity_to_load(
-    problem: Problem, forward: Forward, forces: LawForces, whitener: Whitener, load: ComplexArray
+def sensitivities_to_loads(
+    problem: Problem, forward: Forward, forces: LawForces, whitener: Whitener, loads: list[ComplexArray]
 ) -> FloatArray:
-    """Whitened response to a load (F, n) on the degrees of freedom, with the reaction of the laws, (R,).
+    """Whitened responses to loads (F, n) on the degrees of freedom, with the reaction of the laws, (R, loads).
 
     To the same approximation as the columns of a fit: a load that they can imitate leaves nothing beside them.
     """
     parameters, states = len(forward.system.parameters), forward.plant.structure.states
-    bins = len(forward.part.grid.omega)
+    bins, last = len(forward.part.grid.omega), parameters + len(loads)
     known = _Sensitivities(
-        JacobianColumns(forward, whitener, parameters + 1 + states),
+        JacobianColumns(forward, whitener, last + states),
         np.zeros((bins, parameters), dtype=complex),
-        {parameters: load},
-        np.zeros((bins, 1, len(forces.terms)), dtype=complex),
-        np.zeros(parameters + 1),
+        dict(enumerate(loads, parameters)),
+        np.zeros((bins, len(loads), len(forces.terms)), dtype=complex),
+        np.zeros(last),
     )
-    known.packed.add_load(parameters, load)
+    for column, load in known.loads.items():
+        known.packed.add_load(column, load)
     _add_laws_answers(known, problem, whitener, forward, forces, states)
-    return known.packed.jacobian[:, parameters]
+    return known.packed.jacobian[:, parameters:last]
 
 
 @dataclass

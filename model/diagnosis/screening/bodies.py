@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.ndimage import median_filter
 
-from sprung.model.diagnosis.fit.jacobian import sensitivity_to_load
+from sprung.model.diagnosis.fit.jacobian import sensitivities_to_loads
 from sprung.model.diagnosis.response.forward import structure_of
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ScreeningRules
@@ -30,32 +30,36 @@ def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tup
     for law in laws:
         if not isinstance(law, BodyLaw):
             continue
+        if law.scales:
+            yield from _masses(projector, law)
+            continue
         for index, name in enumerate(system.bodies):
-            if law.scales:
-                if f"{name}.{law.scales}" not in {p.name for p in system.parameters}:
-                    yield _mass(projector, law, index, name), 1
-            elif law.load is not None:
+            if law.load is not None:
                 yield _line(projector, law, index, name)
             else:
                 yield from _modes(projector, law, index, name)
 
 
-def _mass(projector: Projector, law: BodyLaw, index: int, name: str) -> Candidate:
-    """Another mass of a body; stiffness and damping absorb most of it, so that the laws' reaction counts."""
-    fit, grid = projector.fit, projector.grid
-    structure = fit.forward.plant.structure
-    dofs = structure.body_of_dof == index
-    load = np.where(dofs, -structure.mass * fit.motions.acceleration, 0.0)
-    if fit.forces is not None and not projector.problem.process_noise:
-        column = sensitivity_to_load(projector.problem, fit.forward, fit.forces, fit.whitener, load)
-        score, amplitude = projector.score(column, least=_TANGENT**2)
+def _masses(projector: Projector, law: BodyLaw) -> Iterator[tuple[Candidate, int]]:
+    """Other masses of bodies; stiffness and damping absorb most of them, so that the laws' reaction counts."""
+    fit, problem, band = projector.fit, projector.problem, projector.grid.band
+    structure, estimated = fit.forward.plant.structure, {p.name for p in problem.system.parameters}
+    held = [i for i, name in enumerate(problem.system.bodies) if f"{name}.{law.scales}" not in estimated]
+    dofs = [structure.body_of_dof == index for index in held]
+    loads = [np.where(own, -structure.mass * fit.motions.acceleration, 0.0) for own in dofs]
+    if held and fit.forces is not None and not problem.process_noise:
+        columns = sensitivities_to_loads(problem, fit.forward, fit.forces, fit.whitener, loads)
+        scores = [projector.score(column, least=_TANGENT**2) for column in columns.T]
     else:
-        column = projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load[grid.band]))
-        spread = projector.spread(column, fit.forward.inputs_by_mass(dofs)[grid.band])
-        score, amplitude = projector.score(column, (spread, 0.0))
-    ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
-    term = Term(law, name, (ratio,), variant="", scales=(0.1,))
-    return Candidate(term, score, MASS)
+        shown = [projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load[band])) for load in loads]
+        spreads = [
+            projector.spread(column, fit.forward.inputs_by_mass(own)[band])
+            for column, own in zip(shown, dofs, strict=True)
+        ]
+        scores = [projector.score(column, (spread, 0.0)) for column, spread in zip(shown, spreads, strict=True)]
+    for index, (score, amplitude) in zip(held, scores, strict=True):
+        ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
+        yield Candidate(Term(law, problem.system.bodies[index], (ratio,), variant="", scales=(0.1,)), score, MASS), 1
 
 
 def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterator[tuple[Candidate, int]]:
