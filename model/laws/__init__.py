@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from sprung.model.laws.base import (
     CLOCK_LEAD,
+    COMPRESSION,
+    EXTENSION,
     BodyLaw,
     ElementLaw,
     Law,
@@ -108,6 +110,8 @@ def find_law(name: str) -> Law:
 __all__ = [
     "CATALOGUE",
     "CLOCK_LEAD",
+    "COMPRESSION",
+    "EXTENSION",
     "BodyLaw",
     "ElementLaw",
     "Law",

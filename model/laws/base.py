@@ -26,6 +26,7 @@ from sprung.model.signals import FloatArray
 # "elements": all springs of a system together
 Where = Literal["element", "elements", "pair", "body", "bodies", "sensor", "support", "axle"]
 Channels = Literal["sensor", "support", "force"]
+EXTENSION, COMPRESSION = "extension", "compression"  # forms of a law that acts in this direction alone
 Values = Sequence[Any]  # one float or array per parameter, in the law's order; they broadcast with the motion
 
 _AT_REST = 0.01  # of the largest step of the rate at a reversal: less is no motion
@@ -220,8 +221,8 @@ class ElementLaw(Parametrised):
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
     # Of a wider law that is tried in place of the narrower one once that is found: starts, from that one's values
     widened: Callable[[Values, Observed], Sequence[Values]] | None = None
-    forms: tuple[tuple[str, ElementLaw], ...] = ()  # variants with the same parameters, sought as well
-    one_sided: bool = False  # a form that acts in one direction of the deflection: another may act in the other one
+    # Variants with the same parameters, sought as well; those of either direction may stand beside each other
+    forms: tuple[tuple[str, ElementLaw], ...] = ()
     formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down
     memory_formula: str = ""  # the rate of its one state `z`, likewise
     parts: tuple[tuple[str, str], ...] = ()  # both of every part, where the force is a sum of such

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from sprung.model.laws.base import (
+    COMPRESSION,
+    EXTENSION,
     RARE,
     ElementLaw,
     Motion,
@@ -137,30 +140,18 @@ def _compression_stop(motion: Motion, p: Values, element: SpringDamper) -> Float
     return found
 
 
-# Of cars most stops act in compression alone
-BUMP_STOP = replace(
+def _on_one_side(
+    side: str, force: Callable[[Motion, Values, SpringDamper], FloatArray], formula: str
+) -> tuple[str, ElementLaw]:
+    sentence = f"a stop of {{stiffness}} is touched beyond {{gap}} of {side}"
+    return side, replace(_BUMP_STOP, force=force, formula=formula, sentence=sentence)
+
+
+BUMP_STOP = replace(  # of cars most stops act in compression alone
     BUMP_STOP,
     forms=(
-        (
-            "extension",
-            replace(
-                _BUMP_STOP,
-                force=_extension_stop,
-                formula="stiffness * max(d - gap, 0)",
-                sentence="a stop of {stiffness} is touched beyond {gap} of extension",
-                one_sided=True,
-            ),
-        ),
-        (
-            "compression",
-            replace(
-                _BUMP_STOP,
-                force=_compression_stop,
-                formula="stiffness * min(d + gap, 0)",
-                sentence="a stop of {stiffness} is touched beyond {gap} of compression",
-                one_sided=True,
-            ),
-        ),
+        _on_one_side(EXTENSION, _extension_stop, "stiffness * max(d - gap, 0)"),
+        _on_one_side(COMPRESSION, _compression_stop, "stiffness * min(d + gap, 0)"),
     ),
 )
 

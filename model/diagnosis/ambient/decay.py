@@ -6,7 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from sprung.model.diagnosis.record.signals import Signals, roughness
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.record.white_noise import roughness
 from sprung.model.diagnosis.rules import RULES, AmbientRules, Rules
 from sprung.model.signals import FloatArray
 

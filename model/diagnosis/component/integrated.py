@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sprung.model.diagnosis.component.motion import without_gaps
-from sprung.model.diagnosis.record.signals import white_noise
+from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.signals import FloatArray
 

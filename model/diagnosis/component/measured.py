@@ -23,7 +23,7 @@ from sprung.model.diagnosis.component.motion import (
 from sprung.model.diagnosis.component.own import observed, own_pieces
 from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
-from sprung.model.diagnosis.record.signals import white_noise
+from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.diagnosis.rules import RULES, ComponentRules, Rules
 from sprung.model.laws import Law, SpringDamper
 from sprung.model.laws.following import Covariate

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from sprung.model.diagnosis.record.signals import white_noise
+from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.signals import FloatArray
 

@@ -14,7 +14,7 @@ from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.diagnosis.selection.plausible import harmonic
-from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
+from sprung.model.laws import COMPRESSION, EXTENSION, BodyLaw, ElementLaw, Law, StructureLaw
 
 
 def untried(state: Investigation, candidates: Iterable[Candidate]) -> list[Candidate]:
@@ -42,8 +42,7 @@ def _repeats(state: Investigation, candidate: Candidate) -> bool:
 
 def _are_two_sides(one: Term, other: Term) -> bool:
     """Whether two terms of a law act in the two directions of a deflection."""
-    sided = all(isinstance(term.law, ElementLaw) and term.law.one_sided for term in (one, other))
-    return sided and one.variant != other.variant
+    return {one.variant, other.variant} == {EXTENSION, COMPRESSION}
 
 
 def _hopeless(state: Investigation, candidate: Candidate) -> bool:

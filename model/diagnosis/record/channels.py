@@ -103,17 +103,17 @@ def _above_drift(system: System, signals: Signals, notes: list[str], rules: Reco
 
     Errors: `TooLittleError` if too little is left.
     """
-    filtered, edge = passed(system, signals, rules)
-    if edge:
+    filtered, cutoff = passed(system, signals, rules)
+    if cutoff:
         end = filtered.start + filtered.samples / filtered.sample_rate
         notes.append(
-            f"supports measured by accelerations alone: all signals are compared above {edge:.2g} Hz, "
+            f"supports measured by accelerations alone: all signals are compared above {cutoff:.2g} Hz, "
             f"{filtered.start:.1f} s to {end:.1f} s of the recording"
         )
         if filtered.samples < rules.minimum_samples:
             raise TooLittleError(
                 f"too short to decide anything: {signals.samples / signals.sample_rate:.1f} s, of which "
-                f"{rules.settled / edge:.1f} s at either end are lost to accelerations that must be integrated"
+                f"{rules.settled / cutoff:.1f} s at either end are lost to accelerations that must be integrated"
             )
     return filtered
 

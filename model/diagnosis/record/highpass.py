@@ -1,7 +1,7 @@
 """High-pass filter for recordings whose supports are measured by acceleration alone.
 
 Over a recording, integrated acceleration noise drifts by metres.  Filtering all signals alike preserves their linear
-relation, and forces of nonlinear laws are filtered as well (`Grid.let_through`): a damper that is harder in extension
+relation, and forces of nonlinear laws are filtered as well (`Grid.law_transform`): a damper that is harder in extension
 pulls the body down slowly, which filtered signals do not show.  So everything well below the slowest mode is removed:
 there bodies follow their supports, elements hardly deflect, and nothing is identifiable.  Transients of the filter at
 both ends are cut off.
@@ -37,13 +37,13 @@ def slowest_mode(system: System, held: float) -> float:
 
 
 def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signals, float]:
-    """Signals without the drift of integrated accelerations, and the filter's edge, Hz; 0 if none is needed."""
+    """Signals without the drift of integrated accelerations, and the filter's cutoff, Hz; 0 if none is needed."""
     alone = signals.integrated & signals.accelerated & np.isnan(signals.velocity[0])
     if not alone.any() or carries_everything(system, signals.support_names[0]):
         return signals, 0.0
-    edge = rules.passed * slowest_mode(system, rules.held)
-    cut = round(rules.settled / edge * signals.sample_rate)
-    filtered = butter(HIGH_PASS_ORDER, edge, "highpass", fs=signals.sample_rate, output="sos")
+    cutoff = rules.passed * slowest_mode(system, rules.held)
+    cut = round(rules.settled / cutoff * signals.sample_rate)
+    filtered = butter(HIGH_PASS_ORDER, cutoff, "highpass", fs=signals.sample_rate, output="sos")
 
     def high(series: FloatArray) -> FloatArray:
         known = np.isfinite(series[0]) if series.shape[1] else np.zeros(0, dtype=bool)
@@ -59,6 +59,6 @@ def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signal
         force=high(signals.force),
         sensors=high(signals.sensors),
         fused=(),
-        edge=edge,
+        cutoff=cutoff,
     )
-    return whole.part(cut, max(signals.samples - cut, cut)), edge
+    return whole.part(cut, max(signals.samples - cut, cut)), cutoff

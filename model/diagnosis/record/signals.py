@@ -11,14 +11,15 @@ and the faults of the input channels.  A measured acceleration is fused with wha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from math import comb
 
 import numpy as np
 from scipy.integrate import trapezoid
 
 from sprung.model.diagnosis.record.fused import FusedMotion, ParityResiduals, parity_residuals
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
+from sprung.model.diagnosis.record.white_noise import roughness, white_noise
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
 from sprung.model.schema import ForceInput, SupportInput
@@ -26,14 +27,8 @@ from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
+_UNDECLARED = 1e-3  # of a signal, noise that is not declared
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
-_ORDER = 8  # of the differences that tell those
-_WHITE_ORDER = 6  # of the differences that tell white noise
-_WHITE_BLOCKS = 40  # of them, the median counts: bursts are no noise
-_EDGE_BLOCK, _EDGE_BLOCKS = 100, 5  # samples of a block, and blocks, that tell a spectrum's edge
-_EVEN_BANDS = ((0.26, 0.30), (0.30, 0.34), (0.34, 0.38))  # of the sample rate, below the edge of any usual filter
-_EMPTY_BAND = (0.46, 0.5)  # of the sample rate, beyond it
-_EVEN, _EMPTY = 1.8, 0.2  # of power, within which bands are even and below which one is empty
 _SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
 _END_DEGREE = 4  # of the polynomial through them, of a support's motion
@@ -58,7 +53,7 @@ class Signals:
     start: float = 0.0  # s, time of the first sample since the start of the recording
     speed: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # m/s, on a track, where measured, (T, 0 or 1)
     averaged: int = 1  # samples as they were recorded in every one of these
-    edge: float = 0.0  # Hz, of the high-pass filter that they have passed; 0: none
+    cutoff: float = 0.0  # Hz, of the high-pass filter that they have passed; 0: none
     fused: tuple[FusedMotion, ...] = ()  # of the supports whose acceleration is measured beside something else
 
     @property
@@ -139,67 +134,37 @@ def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.
 
     Estimates of a sensor's may fall to a share of that, or of what its fastest changes leave room for.
     """
-    displacement, velocity, acceleration, force = [], [], [], []
-    at_support = at_force = 0
-    for source in system.file.inputs.values():
-        if isinstance(source, SupportInput):
-            size = _size(signals.displacement[:, at_support])
-            fused = bool(signals.accelerated[at_support])
-            stated = {quantity: address.noise for quantity, address in source.measured.items()}
-            level = stated.get("displacement", 0.0) or 1e-3 * size
-            if signals.integrated[at_support]:
-                level = _INTEGRATED * max(level, size)
-            displacement.append(level)
-            level = stated.get("velocity", 0.0) or 1e-3 * _size(signals.velocity[:, at_support])
-            measured = np.isfinite(signals.velocity[0, at_support]) or (fused and "velocity" in stated)
-            velocity.append(level if measured else np.inf)
-            level = stated.get("acceleration", 0.0) or USUAL_NOISE["m/s^2"]
-            acceleration.append(level if fused else np.inf)
-            at_support += 1
-        elif isinstance(source, ForceInput):
-            force.append(source.noise or 1e-3 * _size(signals.force[:, at_force]))
-            at_force += 1
-    listed = list(system.file.sensors.values())
-    sensors = [
-        listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
-    ]
-    moved, rates, shaken, pushed = (
-        np.array(own) / np.sqrt(signals.averaged) for own in (displacement, velocity, acceleration, force)
-    )
-    levels = np.array(sensors) / np.sqrt(signals.averaged)
-    least = rules.least_noise * np.minimum(levels, roughness(signals.sensors))
-    return Noise(moved, rates, shaken, pushed, levels, least)
+    inputs = system.file.inputs.values()
+    supports = [source for source in inputs if isinstance(source, SupportInput)]
+    forces = [source for source in inputs if isinstance(source, ForceInput)]
+    declared = list(system.file.sensors.values())
+    averaged = np.sqrt(signals.averaged)
+    motion = [_support_noise(source, signals, i) for i, source in enumerate(supports)]
+    displacement, velocity, acceleration = np.array(motion).reshape(-1, 3).T / averaged
+    force = _stated_or_share([source.noise for source in forces], signals.force) / averaged
+    sensors = _stated_or_share([declared[i].noise for i in signals.sensor_index], signals.sensors) / averaged
+    least = rules.least_noise * np.minimum(sensors, roughness(signals.sensors))
+    return Noise(displacement, velocity, acceleration, force, sensors, least)
 
 
-def white_noise(series: FloatArray) -> float:
-    """Standard deviation of the white noise that a series (T,) carries, from its differences of high order.
+def _support_noise(source: SupportInput, signals: Signals, i: int) -> tuple[float, float, float]:
+    """Noise of a support's displacement (m), velocity (m/s) and acceleration (m/s^2); inf where it is not measured."""
+    stated = {quantity: address.noise for quantity, address in source.measured.items()}
+    size, fused = _size(signals.displacement[:, i]), bool(signals.accelerated[i])
+    displacement = stated.get("displacement", 0.0) or _UNDECLARED * size
+    if signals.integrated[i]:
+        displacement = _INTEGRATED * max(displacement, size)
+    velocity = acceleration = np.inf
+    if np.isfinite(signals.velocity[0, i]) or (fused and "velocity" in stated):
+        velocity = stated.get("velocity", 0.0) or _UNDECLARED * _size(signals.velocity[:, i])
+    if fused:
+        acceleration = stated.get("acceleration", 0.0) or USUAL_NOISE["m/s^2"]
+    return displacement, velocity, acceleration
 
-    Smooth motion leaves them by its power above about a third of the sample rate only.  Of a series from which a
-    filter took what is next to half the sample rate (`_below_an_edge`), that of the noise before the filter.
-    """
-    differences = np.diff(series, _WHITE_ORDER) ** 2 / comb(2 * _WHITE_ORDER, _WHITE_ORDER)
-    blocks = np.array_split(differences, min(_WHITE_BLOCKS, max(1, len(differences) // 10)))
-    return max(float(np.sqrt(np.median([block.mean() for block in blocks]))), _below_an_edge(series))
 
-
-def _below_an_edge(series: FloatArray) -> float:
-    """Standard deviation of white noise that a filter has cut off below half the sample rate, as resampling does.
-
-    Its spectrum is even up to the filter's edge and has next to nothing beyond; 0 where it is not.
-    """
-    count = min(_WHITE_BLOCKS, len(series) // _EDGE_BLOCK)
-    if count < _EDGE_BLOCKS:
-        return 0.0
-    size = len(series) // count
-    window = np.hanning(size)
-    rest = np.diff(series[: count * size], prepend=series[0]).reshape(count, size)  # what moves slowly leaks less
-    frequency = np.fft.rfftfreq(size)
-    power = np.abs(np.fft.rfft(rest * window)) ** 2 / np.sum(window**2)
-    power[:, 1:] /= (2 * np.sin(np.pi * frequency[1:])) ** 2
-    bands = [(frequency >= low) & (frequency < high) for low, high in (*_EVEN_BANDS, _EMPTY_BAND)]
-    *even, empty = (float(np.median(power[:, band].mean(axis=1))) for band in bands)
-    cut = max(even) < _EVEN * min(even) and empty < _EMPTY * min(even)
-    return float(np.sqrt(np.mean(even))) if cut else 0.0
+def _stated_or_share(stated: Sequence[float], series: FloatArray) -> FloatArray:
+    """Noise of channels (m,) as it is stated, else a share of their signals (N, m)."""
+    return np.array([noise or _UNDECLARED * _size(series[:, i]) for i, noise in enumerate(stated)])
 
 
 def seen_noise(signals: Signals, declared: Noise, most: float) -> Noise:
@@ -214,12 +179,6 @@ def seen_noise(signals: Signals, declared: Noise, most: float) -> Noise:
     shown = np.array([white_noise(series) for series in signals.displacement.T])
     level = np.clip(shown, declared.displacement, most * declared.displacement)
     return replace(declared, displacement=np.where(once, level, declared.displacement))
-
-
-def roughness(series: FloatArray) -> FloatArray:
-    """The strongest white noise that series (T, m) can hold, (m,): that of their differences of high order."""
-    differences = np.diff(series, _ORDER, axis=0)
-    return np.asarray(np.std(differences, axis=0) / np.sqrt(comb(2 * _ORDER, _ORDER)))
 
 
 def _size(series: FloatArray) -> float:
@@ -259,7 +218,7 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
 
     `differentiated`: sensors whose series are compared by their rates (`drifting`), (S,).
     """
-    grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start, signals.edge)
+    grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start, signals.cutoff)
     differentiated = np.zeros(signals.sensors.shape[1], dtype=bool) if differentiated is None else differentiated
     sensors = signals.sensors
     if differentiated.any():

@@ -25,13 +25,11 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 DEGREE = 5  # of the polynomials: quadratic inputs, integrated twice by a free body
 OVERSAMPLING = 4  # laws with kinks make harmonics beyond the Nyquist frequency of the record
 BAND = 0.30  # of the sample rate: above it anti-alias filters attenuate
-
-
 HIGH_PASS_ORDER = 4  # Butterworth, run forwards and backwards
 
 
 def high_pass_gain(ratio: FloatArray) -> FloatArray:
-    """Gain at frequencies in units of the edge: a Butterworth filter's, squared."""
+    """Gain at frequencies in units of the cutoff: a Butterworth filter's, squared."""
     power = np.abs(ratio) ** (2 * HIGH_PASS_ORDER)
     gain: FloatArray = power / (1 + power)
     return gain
@@ -44,7 +42,7 @@ class Grid:
     samples: int
     step: float
     start: float = 0.0  # s, time of the first sample of this part since the start of the recording
-    edge: float = 0.0  # Hz, of the high-pass filter that all signals have passed (`highpass`); 0: none
+    cutoff: float = 0.0  # Hz, of the high-pass filter that all signals have passed (`highpass`); 0: none
 
     @cached_property
     def omega(self) -> FloatArray:
@@ -114,21 +112,47 @@ class Grid:
         )
         return found
 
-    def let_through(self, omega: FloatArray) -> FloatArray:
-        """Gain of the signals' high-pass filter at frequencies (rad/s); 1 without one."""
-        if not self.edge:
-            return np.ones_like(omega)
-        return high_pass_gain(omega / (2 * np.pi * self.edge))
+    @cached_property
+    def _law_gain(self) -> FloatArray | None:
+        """Gain of the signals' high-pass filter over the bins of the oversampled axis, (2N + 1,); None without one."""
+        if not self.cutoff:
+            return None
+        bins = np.fft.rfftfreq(OVERSAMPLING * self.samples, self.step / OVERSAMPLING)
+        return high_pass_gain(np.asarray(bins / self.cutoff, dtype=np.float64))
 
-    def coarse_forces(self, fine_series: FloatArray) -> ComplexArray:
-        """Transform of oversampled forces of laws, kept up to the record's Nyquist frequency, as far as they show."""
-        full = scipy.fft.rfft(fine_series, axis=0)
-        found: ComplexArray = full[: len(self.omega)] / (OVERSAMPLING * np.sqrt(self.samples))
-        return found * self.let_through(self.omega).reshape((-1,) + (1,) * (found.ndim - 1))
+    def law_transform(self, forces: FloatArray, axis: int = 0) -> ComplexArray:
+        """Transform of oversampled forces of laws along an axis, 4N -> 2N + 1 bins, not scaled, as the signals show it.
 
-    def compared_forces(self, fine_series: FloatArray) -> ComplexArray:
-        """Compared bins of oversampled forces of laws, (m, OVERSAMPLING N) -> (m, compared bins), as they show."""
-        return self.compared_spectra(fine_series) * self.let_through(self.omega[self.band])
+        Signals behind a high-pass filter show of the forces what passes it, too.
+        """
+        found: ComplexArray = scipy.fft.rfft(forces, axis=axis)
+        if self._law_gain is None:
+            return found
+        return found * self._law_gain.reshape((-1,) + (1,) * (found.ndim - 1 - axis))
+
+    def split_law_forces(self, forces: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        """Periodic part of oversampled forces of laws (4N, m), as `law_transform`, and polynomial, (DEGREE + 1, m).
+
+        The polynomial consists of the line through both ends and the mean of the remainder; it does not pass a
+        high-pass filter.
+        """
+        line = np.zeros((DEGREE + 1, forces.shape[1]))
+        line[1] = forces[-1] - forces[0]
+        rest = forces - self.fine_monomials[:, 1:2] * line[1]
+        line[0] = rest.mean(axis=0)
+        periodic = self.law_transform(rest - line[0])
+        return periodic, np.zeros_like(line) if self.cutoff else line
+
+    def coarse_forces(self, forces: FloatArray) -> ComplexArray:
+        """Transform of oversampled forces of laws, (4N, ...) -> (F, ...), up to the record's Nyquist frequency."""
+        found: ComplexArray = self.law_transform(forces)[: len(self.omega)] / (OVERSAMPLING * np.sqrt(self.samples))
+        return found
+
+    def compared_forces(self, forces: FloatArray) -> ComplexArray:
+        """Compared bins of oversampled forces of laws, (m, 4N) -> (m, compared bins)."""
+        full = self.law_transform(forces, axis=1)
+        found: ComplexArray = full[:, self.band] / (OVERSAMPLING * np.sqrt(self.samples))
+        return found
 
     def compared_spectra(self, fine_series: FloatArray) -> ComplexArray:
         """Compared bins of oversampled series, (m, OVERSAMPLING N) -> (m, compared bins), in one transform."""

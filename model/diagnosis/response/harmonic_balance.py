@@ -14,9 +14,9 @@ from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import irfft, rfft
+from scipy.fft import irfft
 
-from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
+from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray
 from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import SpringDamper
@@ -111,7 +111,7 @@ class HarmonicBalance:
         """Response of the system to forces (4N, m)."""
         plant, grid = self.plant, self.grid
         d, v = self.motion(force)
-        fine_spectrum, line = self.decompose(force)
+        fine_spectrum, line = grid.split_law_forces(force)
         spectrum = fine_spectrum[: len(grid.omega)] / (OVERSAMPLING * np.sqrt(grid.samples))
         motion = np.einsum("bkpn,kb->pn", self.lines, line[:2])
         sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ self.wide.T, spectrum)
@@ -149,24 +149,9 @@ class HarmonicBalance:
         above = (rows / (1j * high[:, None] - values)[:, None, :]) @ columns
         return np.concatenate([known, above])
 
-    def decompose(self, force: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """Periodic spectrum on the oversampled axis' bins, (2N + 1, m), and polynomial, (DEGREE + 1, m).
-
-        The polynomial consists of the line through both ends and the mean of the remainder.  Of records behind a
-        high-pass filter only what that lets through counts, and no polynomial.
-        """
-        line = np.zeros((DEGREE + 1, force.shape[1]))
-        line[1] = force[-1] - force[0]
-        rest = force - self.powers[:, 1:2] * line[1]
-        line[0] = rest.mean(axis=0)
-        spectrum = rfft(rest - line[0], axis=0)
-        if self.grid.edge:
-            return spectrum * self.grid.let_through(np.abs(self.jw))[:, None], np.zeros_like(line)
-        return spectrum, line
-
     def motion(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflection and rate along the ports under forces (4N, m), each (4N, m)."""
-        spectrum, line = self.decompose(force)
+        spectrum, line = self.grid.split_law_forces(force)
         answer = np.einsum("fab,fb->af", self.compliance, spectrum)
         swinging = irfft(np.stack([answer, self.jw * answer]), len(self.d0))  # one transform of contiguous series
         steady = np.einsum("kpab,kb->pa", self.line_d, line[:2])

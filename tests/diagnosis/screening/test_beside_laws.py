@@ -80,7 +80,7 @@ def test_the_force_of_a_law_passes_the_filter_that_all_signals_passed() -> None:
     # a damper that is harder in extension pulls the body down slowly, which high-passed signals do not show
     one = effect(cars.HUBS, "damper_asymmetry")
     problem, fit = fitted(one, as_system(with_its_law(one)), seconds=40.0)
-    assert problem.part.grid.edge > 0
+    assert problem.part.grid.cutoff > 0
     assert fit.reduced < 1.15
 
 
