@@ -11,7 +11,7 @@ from sprung.model.laws import CATALOGUE
 from sprung.model.laws.base import BodyLaw, ElementLaw, Law, SensorLaw, SpringDamper, StructureLaw, SupportLaw
 from sprung.model.laws.expression import FormulaError
 from sprung.model.laws.formula import EFFECT, formula_law, without_force
-from sprung.model.schema import GROUND, SupportInput, SystemFile
+from sprung.model.schema import GROUND, Element, SupportInput, SystemFile
 
 _BESIDE = ("with", "variant", "formula", "memory")  # keys of a law that are no parameters
 
@@ -80,59 +80,43 @@ def _placed(
     kinds: tuple[type, ...],
     catalogue: Sequence[Law],
 ) -> PlacedLaw:
-    law = _law(effect, setting, kinds, catalogue)
-    numbers = {name: value for name, value in setting.items() if not isinstance(value, str)}
-    if isinstance(law, (SensorLaw, ElementLaw)) and "variant" in setting:
-        law = _form(law, str(setting["variant"]))
-    if isinstance(law, StructureLaw) and str(setting.get("variant", law.variants[0])) not in law.variants:
-        raise ValueError(f"variant: {law.name} has no {setting['variant']!r}; it has {', '.join(law.variants)}")
-    given, wanted = set(numbers), set(law.names)
-    if isinstance(law, ElementLaw) and law.wider is not None and given == set(law.wider.names):
-        law, wanted = law.wider, given
-    for name in sorted(given - wanted):
-        raise ValueError(
-            f"{name} is no parameter of it; it has {', '.join(law.names) or 'none'}{did_you_mean(name, law.names)}"
-        )
-    for name in law.names:
-        if name not in numbers:
-            raise ValueError(f"{name} is missing")
-    values = [numbers[name] for name in law.names]
-    known = [value if isinstance(value, LawValue) else LawValue(value=float(value)) for value in values]
-    for spec, value in zip(law.parameters, known, strict=True):
-        if not spec.admits(value.value):
-            raise ValueError(
-                f"{spec.name} must lie between {spec.low:g} and {spec.high:g} {spec.unit}, not {value.value:g}"
-            )
-    given_values = tuple(value.value for value in known)
-    if isinstance(law, ElementLaw) and law.name == EFFECT:
-        element = file.elements[location]
-        missing = without_force(law, given_values, SpringDamper(element.stiffness.value, element.damping.value))
-        if missing:
-            raise ValueError(f"formula {law.formula!r}: {missing}")
+    """One law of a file.  Errors: ValueError, one line, for anything that does not fit it."""
+    numbers, texts = _numbers_and_texts(setting)
+    law = _law_of(effect, texts, tuple(numbers), kinds, catalogue)
+    law = _with_variant(law, texts.get("variant"))
+    law = _as_wide_as(law, numbers)
+    values = _values(law, numbers)
+    if isinstance(law, ElementLaw) and law.of_formula:
+        _check_force(law, tuple(value.value for value in values), file.elements[location])
     return PlacedLaw(
         law,
-        _location(file, law, location, setting),
-        given_values,
-        tuple(value.std for value in known),
-        tuple(value.fixed for value in known),
-        str(setting.get("variant", "")),
+        _location(file, law, location, texts.get("with")),
+        tuple(value.value for value in values),
+        tuple(value.std for value in values),
+        tuple(value.fixed for value in values),
+        texts.get("variant", ""),
     )
 
 
-def _law(effect: str, setting: LawSetting, kinds: tuple[type, ...], catalogue: Sequence[Law]) -> Law:
+def _numbers_and_texts(setting: LawSetting) -> tuple[dict[str, LawValue], dict[str, str]]:
+    """Parameters, and what stands beside them."""
     texts = {name: value for name, value in setting.items() if isinstance(value, str)}
     for name, text in texts.items():
         if name not in _BESIDE:
             raise ValueError(f"{name}: a number is expected, not {text!r}")
-    if effect == EFFECT and ElementLaw in kinds:
-        if "formula" not in texts:
-            raise ValueError("formula: the text of the force is missing")
-        names = tuple(name for name in setting if name not in texts)
-        try:
-            return formula_law(texts["formula"], texts.get("memory", ""), names)
-        except FormulaError as error:
-            raise ValueError(str(error)) from None
+    numbers = {name: value for name, value in setting.items() if not isinstance(value, str)}
+    return {
+        name: value if isinstance(value, LawValue) else LawValue(value=float(value)) for name, value in numbers.items()
+    }, texts
+
+
+def _law_of(
+    effect: str, texts: Mapping[str, str], names: tuple[str, ...], kinds: tuple[type, ...], catalogue: Sequence[Law]
+) -> Law:
+    """The law of a name among those that belong to a place of these kinds; names: of the parameters that are given."""
     of_element = ElementLaw in kinds
+    if effect == EFFECT and of_element:
+        return _formula_of(texts, names)
     fitting = [
         law
         for law in catalogue
@@ -141,13 +125,30 @@ def _law(effect: str, setting: LawSetting, kinds: tuple[type, ...], catalogue: S
     for law in fitting:
         if law.name == effect:
             return law
-    elsewhere = any(law.name == effect for law in catalogue)
+    if any(law.name == effect for law in catalogue):
+        raise ValueError("this law does not belong here")
     known = [law.name for law in fitting]
-    raise ValueError(
-        "this law does not belong here"
-        if elsewhere
-        else f"no such law; known here are {', '.join(known)}{did_you_mean(effect, known)}"
-    )
+    raise ValueError(f"no such law; known here are {', '.join(known)}{did_you_mean(effect, known)}")
+
+
+def _formula_of(texts: Mapping[str, str], names: tuple[str, ...]) -> ElementLaw:
+    if "formula" not in texts:
+        raise ValueError("formula: the text of the force is missing")
+    try:
+        return formula_law(texts["formula"], texts.get("memory", ""), names)
+    except FormulaError as error:
+        raise ValueError(str(error)) from None
+
+
+def _with_variant(law: Law, variant: str | None) -> Law:
+    """The form of a law that a variant names; the law itself where its variants are choices within it."""
+    if variant is None:
+        return law
+    if isinstance(law, (SensorLaw, ElementLaw)):
+        return _form(law, variant)
+    if isinstance(law, StructureLaw) and variant not in law.variants:
+        raise ValueError(f"variant: {law.name} has no {variant!r}; it has {', '.join(law.variants)}")
+    return law
 
 
 def _form(law: SensorLaw | ElementLaw, variant: str) -> SensorLaw | ElementLaw:
@@ -158,9 +159,39 @@ def _form(law: SensorLaw | ElementLaw, variant: str) -> SensorLaw | ElementLaw:
     return forms[variant]
 
 
-def _location(file: SystemFile, law: Law, location: str, setting: LawSetting) -> str:
+def _as_wide_as(law: Law, numbers: Mapping[str, LawValue]) -> Law:
+    """The wider form of a law where all of its parameters are given, else the law."""
+    wider = law.wider if isinstance(law, ElementLaw) else None
+    return wider if wider is not None and set(numbers) == set(wider.names) else law
+
+
+def _values(law: Law, numbers: Mapping[str, LawValue]) -> list[LawValue]:
+    """The values of all parameters, in the law's order."""
+    for name in sorted(set(numbers) - set(law.names)):
+        raise ValueError(
+            f"{name} is no parameter of it; it has {', '.join(law.names) or 'none'}{did_you_mean(name, law.names)}"
+        )
+    for name in law.names:
+        if name not in numbers:
+            raise ValueError(f"{name} is missing")
+    for spec in law.parameters:
+        if not spec.admits(numbers[spec.name].value):
+            raise ValueError(
+                f"{spec.name} must lie between {spec.low:g} and {spec.high:g} {spec.unit}, "
+                f"not {numbers[spec.name].value:g}"
+            )
+    return [numbers[name] for name in law.names]
+
+
+def _check_force(law: ElementLaw, values: tuple[float, ...], element: Element) -> None:
+    """Formulas need to have a force at the motions of their element."""
+    missing = without_force(law, values, SpringDamper(element.stiffness.value, element.damping.value))
+    if missing:
+        raise ValueError(f"formula {law.formula!r}: {missing}")
+
+
+def _location(file: SystemFile, law: Law, location: str, partner: str | None) -> str:
     """The place with its partner, for laws that act between two."""
-    partner = setting.get("with")
     where = getattr(law, "where", "")
     if where not in ("pair", "axle", "bodies"):
         if partner is not None:
@@ -168,7 +199,7 @@ def _location(file: SystemFile, law: Law, location: str, setting: LawSetting) ->
         return location
     ends = {*file.bodies, *_supports(file), GROUND}
     known = {"pair": {*file.elements}, "axle": {*file.inputs}, "bodies": ends}[where]
-    if not isinstance(partner, str) or partner not in known or partner == location:
+    if partner not in known or partner == location:
         raise ValueError(f"with: the name of the other one is expected, not {partner!r}")
     return f"{location}|{partner}"
 
