@@ -11,7 +11,7 @@ A sequential test detects that something has changed, not what.  Before an alarm
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import takewhile
@@ -85,12 +85,8 @@ class Attribution:
 
     def updated(self, state: TrackerState, drift: Drift, jump: Jump | None, now: int) -> tuple[Alarm, ...]:
         """Alarms after a window whose centre is at `now`, ns."""
-        common = self._common_changes(state)
-        overloaded = self._overloads(state)
-        quiet = not (state.active or state.changes.active.any() or common or overloaded)
-        quiet = quiet and state.misfit_since is None
-        drifted = self._drifted(state)
-        if quiet and jump is None and not state.stuck and not drifted:
+        common, overloads, drifted = self._common_changes(state), self._overloads(state), self._drifted(state)
+        if jump is None and not (common or overloads or drifted) and _nothing_is_wrong(state):
             return state.alarms
         alarms = [self._present(alarm, state, drift, now) for alarm in state.alarms]
         if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= dev.JUMP_LIMIT[jump.kind]:
@@ -99,13 +95,8 @@ class Attribution:
         alarms = self._with_stuck(alarms, state, now)
         alarms = self._with_common(alarms, common, drift, now)
         alarms = self._with_changes(alarms, state, drift, now)
-        alarms += [
-            self._overload(Alarm("load", f"{body}.load", now, now, "warning"), excess, std)
-            for body, (excess, std) in overloaded.items()
-            if not any(a.kind == "load" and a.closed is None and a.parameter == f"{body}.load" for a in alarms)
-        ]
-        if state.misfit_since is not None and not any(a.kind == "misfit" and a.closed is None for a in alarms):
-            alarms.append(Alarm("misfit", None, state.misfit_since, now, "warning"))
+        alarms = self._with_overloads(alarms, overloads, now)
+        alarms = _with_misfit(alarms, state, now)
         return self._latest(alarms)
 
     def _present(self, alarm: Alarm, state: TrackerState, drift: Drift, now: int) -> Alarm:
@@ -120,16 +111,23 @@ class Attribution:
             return self._load_updated(alarm, state, now)
         name = alarm.parameter or ""
         if "*" in name:
-            members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
-            still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, RECOVERED))
-            if np.isnan(drift.whole[members]).all():  # all baselines are learned anew: there is nothing to compare with
-                return _closed(alarm, now)
-            change, std = _common(replace(drift, change=drift.whole), members)
-            moved = state.changes.active[members].any() and abs(change) > RECOVERED * self._common_limit
-            if not (still or moved):  # a change of one element alone does not keep the alarm of all open
-                return _closed(alarm, now)
-            return self._updated(alarm, change, std)
-        i = self.names.index(name)
+            return self._kind_updated(alarm, name, state, drift, now)
+        return self._single_updated(alarm, self.names.index(name), state, drift, now)
+
+    def _kind_updated(self, alarm: Alarm, name: str, state: TrackerState, drift: Drift, now: int) -> Alarm:
+        """The alarm of elements that changed together, `primary_*.damping`."""
+        members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
+        if np.isnan(drift.whole[members]).all():  # all baselines are learned anew: there is nothing to compare with
+            return _closed(alarm, now)
+        still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, RECOVERED))
+        change, std = _common(replace(drift, change=drift.whole), members)
+        moved = state.changes.active[members].any() and abs(change) > RECOVERED * self._common_limit
+        if not (still or moved):  # a change of one element alone does not keep the alarm of all open
+            return _closed(alarm, now)
+        return self._updated(alarm, change, std)
+
+    def _single_updated(self, alarm: Alarm, i: int, state: TrackerState, drift: Drift, now: int) -> Alarm:
+        """The alarm of parameter `i`."""
         if state.changes.active[i] == 0:
             return _closed(alarm, now)
         return self._updated(alarm, float(drift.change[i]), float(drift.std[i]))
@@ -195,6 +193,16 @@ class Attribution:
                 found[deviation.name] = (excess, std * float(np.exp(value)))
         return found
 
+    def _with_overloads(
+        self, alarms: list[Alarm], overloads: Mapping[str, tuple[float, float]], now: int
+    ) -> list[Alarm]:
+        """Opens an alarm for each body whose load is beyond its limits."""
+        opened = {alarm.parameter for alarm in alarms if alarm.kind == "load" and alarm.closed is None}
+        new = {f"{body}.load": beyond for body, beyond in overloads.items() if f"{body}.load" not in opened}
+        return alarms + [
+            self._overload(Alarm("load", name, now, now, "warning"), *beyond) for name, beyond in new.items()
+        ]
+
     def _load_updated(self, alarm: Alarm, state: TrackerState, now: int) -> Alarm:
         body = (alarm.parameter or "").removesuffix(".load")
         found = self._overloads(state, 0.0).get(body)
@@ -209,29 +217,36 @@ class Attribution:
         alarmed = {alarm.parameter for alarm in alarms if alarm.closed is None and alarm.kind == "change"}
         out = list(alarms)
         for i in np.flatnonzero(state.changes.active).tolist():
-            together = f"*.{self.kinds[i]}"
-            members = self._of_kind(self.kinds[i])
-            kinds = [name for name in alarmed if name and "*" in name and fnmatchcase(self.names[i], name)]
-            whole = replace(drift, change=drift.whole)
-            along = self._changed_with(int(i), whole, members)
-            if self.names[i] in alarmed or (kinds and along):
-                continue
-            since = state.changes.up_since if state.changes.active[i] > 0 else state.changes.down_since
-            others = self._alternatives(int(i), state, drift, int(since[i]), now)
-            if others is None:
-                continue
-            others = (*others, *self._masses_of([int(i)], whole))
-            name, change, std = self.names[i], float(drift.change[i]), float(drift.std[i])
-            if not kinds and along and self._all_changed(whole, members):
-                name, (change, std), others = (
-                    together,
-                    _common(whole, members),
-                    self._masses_of(members.tolist(), whole),
-                )
-            alarm = Alarm("change", name, int(since[i]), now, "warning", 0.0, 0.0, 0.0, alternatives=others)
-            alarmed.add(name)
-            out.append(self._updated(alarm, change, std))
+            opened = None if self.names[i] in alarmed else self._opened(i, alarmed, state, drift, now)
+            if opened is not None:
+                alarmed.add(opened.parameter)
+                out.append(opened)
         return out
+
+    def _opened(
+        self, i: int, alarmed: Collection[str | None], state: TrackerState, drift: Drift, now: int
+    ) -> Alarm | None:
+        """A new alarm for the change of parameter `i`, or of all of its quantity; None where none is due (yet).
+
+        alarmed: names of parameters and kinds whose alarms are open.
+        """
+        whole, members = replace(drift, change=drift.whole), self._of_kind(self.kinds[i])
+        along = self._changed_with(i, whole, members)
+        in_a_kind = any(name and "*" in name and fnmatchcase(self.names[i], name) for name in alarmed)
+        if in_a_kind and along:
+            return None
+        since = int((state.changes.up_since if state.changes.active[i] > 0 else state.changes.down_since)[i])
+        deviations = self._alternatives(i, state, drift, since, now)
+        if deviations is None:
+            return None
+        if not in_a_kind and along and self._all_changed(whole, members):
+            name, (change, std) = f"*.{self.kinds[i]}", _common(whole, members)
+            others = self._masses_of(members.tolist(), whole)
+        else:
+            name, change, std = self.names[i], float(drift.change[i]), float(drift.std[i])
+            others = (*deviations, *self._masses_of([i], whole))
+        alarm = Alarm("change", name, since, now, "warning", 0.0, 0.0, 0.0, alternatives=others)
+        return self._updated(alarm, change, std)
 
     def _of_kind(self, kind: str) -> IntArray:
         return np.flatnonzero([k == kind for k in self.kinds])
@@ -377,6 +392,18 @@ class Attribution:
         closed = [alarm for alarm in alarms if alarm.closed is not None]
         surplus = {alarm.key for alarm in closed[: max(0, len(closed) - self.settings.kept_alarms)]}
         return tuple(alarm for alarm in alarms if alarm.closed is None or alarm.key not in surplus)
+
+
+def _nothing_is_wrong(state: TrackerState) -> bool:
+    """Whether no alarm is open and no test of a single parameter, channel or window has fired."""
+    return not (state.active or state.changes.active.any() or state.stuck or state.misfit_since is not None)
+
+
+def _with_misfit(alarms: list[Alarm], state: TrackerState, now: int) -> list[Alarm]:
+    """Opens the alarm of windows that the model does not explain."""
+    if state.misfit_since is None or any(a.kind == "misfit" and a.closed is None for a in alarms):
+        return alarms
+    return [*alarms, Alarm("misfit", None, state.misfit_since, now, "warning")]
 
 
 def _closed(alarm: Alarm, now: int) -> Alarm:

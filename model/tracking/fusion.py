@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sprung.model.signals import BoolArray, Conditions, Deviating, Estimate, FloatArray
+from sprung.model.signals import BoolArray, Conditions, Deviating, Estimate, FloatArray, IntArray
 from sprung.model.tracking import cargo as cargos
 from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import deviations as dev
@@ -28,9 +28,7 @@ from sprung.model.tracking.weather import WeatherModel
 from sprung.model.tracking.window import TrackedWindow, in_linear_scale, noise_weight
 
 PLAUSIBLE = 4.0  # standard deviations about its prediction that a window may move the baseline by
-HARMLESS = (
-    0.3  # standard deviations of uncorrected shift by gains and delays at which a window's load has half its weight
-)
+HARMLESS = 0.3  # standard deviations of shift by gains and delays at which an uncorrected window's load has half weight
 QUIET = 5.0  # log-likelihood ratio of a change above which a parameter's windows are not used to learn slopes
 INFORMATIVE = 0.5  # weight of a window below which its scatter comes from noise, not from unmodelled dynamics
 SETTLING = 20.0  # s after a jump of a deviation: until then the belief may have shared it out among channels
@@ -225,29 +223,30 @@ class Fusion:
     ) -> tuple[kalman.Belief, Cargo | None]:
         """Loads return to their prior after a stop or where a window contradicts them; pressures, if any, refine it."""
         model, cargo = self.model, state.cargo
-        if not self.model.size or cargo is None or not len(model.loads_at):
+        if not model.size or cargo is None or not len(model.loads_at):
             return belief, cargo
         rows = model.loads_at + len(belief.mean) - model.size
-        pressure = np.full(len(rows), np.nan)
-        if conditions is not None and len(conditions.pressure) == len(rows):
-            pressure = np.array(conditions.pressure)
-        departs = elapsed - self.settings.window > dev.STOPPED
-        changed = (
-            found is not None and state.last is not None and not departs and dev.loads_changed(belief, model, found)
-        )
         believed = belief.mean[rows], np.diag(belief.covariance)[rows]
-        prior = np.diag(model.prior)[model.loads]
+        prior, pressure = np.diag(model.prior)[model.loads], _pressure(conditions, len(rows))
+        departs = elapsed - self.settings.window > dev.STOPPED
+        known_before = not departs and state.last is not None
+        changed = known_before and found is not None and dev.loads_changed(belief, model, found)
         contradicted = not (departs or changed) and cargos.contradicted(cargo, *believed, prior)
         if not (departs or changed or contradicted):
             return belief, cargos.during_ride(cargo, pressure)
-        if state.last is not None and not contradicted:
-            past = state.belief.mean[rows], np.diag(state.belief.covariance)[rows]
-            known = past[1] < (KNOWN * self.limit[model.loads_at]) ** 2
-            cargo = cargos.remembered(cargo, *past, known, state.last)
-        if state.last is not None and departs:
-            cargo = cargos.after_ride(cargo, *believed)
-        cargo = cargos.before_ride(cargo, pressure * np.nan if contradicted else pressure, prior)
+        if contradicted:
+            pressure = np.full(len(rows), np.nan)
+        elif state.last is not None:
+            cargo = self._remembered(state, cargo, rows, state.last)
+            cargo = cargos.after_ride(cargo, *believed) if departs else cargo
+        cargo = cargos.before_ride(cargo, pressure, prior)
         return dev.reset_loads(belief, model, cargo.prior, cargo.prior_variance), cargo
+
+    def _remembered(self, state: TrackerState, cargo: Cargo, rows: IntArray, last: int) -> Cargo:
+        """The loads of a state, at `rows` of its belief, kept as those until its last window, ns."""
+        mean, variance = state.belief.mean[rows], np.diag(state.belief.covariance)[rows]
+        known = variance < (KNOWN * self.limit[self.model.loads_at]) ** 2
+        return cargos.remembered(cargo, mean, variance, known, last)
 
     def load(self, belief: kalman.Belief) -> float | None:
         """Logarithm of the loaded mass over the empty one, of the first load; None where it is not known."""
@@ -290,6 +289,13 @@ class Fusion:
         variance = dev.level_variance(state.belief, self.model, state.calibration.base_cross)
         spread = np.sqrt(variance + state.changes.baseline_variance)
         return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
+
+
+def _pressure(conditions: Conditions | None, loads: int) -> FloatArray:
+    """Pressures of the air springs, Pa, one for each load, (L,); NaN where they are not measured."""
+    if conditions is None or len(conditions.pressure) != loads:
+        return np.full(loads, np.nan)
+    return np.array(conditions.pressure)
 
 
 def nanoseconds(seconds: float) -> int:
