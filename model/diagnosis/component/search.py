@@ -273,19 +273,10 @@ def _accepted(
 
     current: the model so far; ranked: models with one more law, best first; base: the model with the given laws alone.
     """
-    near = _near_best(ranked, rules)
-    if not near:
-        return None
-    determined = [r for r in near if _determined(r.fit)] or _determined_rival(ranked)
     alone = len(current.fit.model.pieces) == len(base.model.pieces)
-    near = _without_doubtful_lags(determined or near, current.fit, alone, rules)
-    if not near and (not alone or current.fit.leaves_more):  # else a mere delay within the noise: no law in its place
-        near = [r for r in ranked if not isinstance(r.last, Lag) and r.evidence > 0][:1]
-    if not near:
+    chosen, determined = _leading(ranked, current.fit, alone, rules)
+    if chosen is None:
         return None
-    chosen = _plainest(near, rules)
-    rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
-    forms = tuple(r for r in ranked if r is not chosen and r.last.effect == chosen.last.effect)
     p_value = chance(chosen.gain, chosen.fit.model.count - current.fit.model.count, tests)
     if p_value > rules.alpha or chosen.fit.held_out >= current.fit.held_out:
         return None
@@ -293,7 +284,27 @@ def _accepted(
         return None  # where all may be noise, the law's value must be certain
     if current.fit.model.pieces and not (determined and _removes_enough(chosen.fit, current.fit, base, rules)):
         return None
+    others = [r for r in ranked if r is not chosen]
+    rivals = tuple(r for r in others if r.last.effect != chosen.last.effect)
+    forms = tuple(r for r in others if r.last.effect == chosen.last.effect)
     return Step(chosen, current, rivals, p_value, forms)
+
+
+def _leading(
+    ranked: list[Ranked], current: ComponentFit, alone: bool, rules: ComponentRules
+) -> tuple[Ranked | None, bool]:
+    """The plainest of the best models, and whether any of these is determined by the record.
+
+    alone: whether `current` has no laws but the given ones.
+    """
+    near = _near_best(ranked, rules)
+    if not near:
+        return None, False
+    determined = [r for r in near if _determined(r.fit)] or _determined_rival(ranked)
+    near = _without_doubtful_lags(determined or near, current, alone, rules)
+    if not near and (not alone or current.leaves_more):  # else a mere delay within the noise: no law in its place
+        near = [r for r in ranked if not isinstance(r.last, Lag) and r.evidence > 0][:1]
+    return (_plainest(near, rules) if near else None), bool(determined)
 
 
 def _near_best(ranked: list[Ranked], rules: ComponentRules) -> list[Ranked]:

@@ -33,6 +33,8 @@ from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.plausible import doubt, hardly_there
 
+_BEGUN, _SHARE = 0.25, 0.17  # of the whole progress: before the first finding, and for each
+
 
 @dataclass(frozen=True)
 class _Competition:
@@ -55,14 +57,22 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
         return next_finding(adopt_wider(state, wide), number, progress)
     if not candidates:
         return state
-    share = 0.25 + 0.17 * number
+    share = _BEGUN + _SHARE * number
     competition = _competition(state, candidates, lambda text: progress(share, text))
     state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in competition.implausible)))
     if wide is not None and is_better(state, wide, competition.leading):
         return next_finding(adopt_wider(state, wide), number, progress)
     if not competition.leading:
         return state
-    progress(share + 0.08, f"checking {competition.leading[0].term.location}")
+    progress(share + _SHARE / 2, f"checking {competition.leading[0].term.location}")
+    return _with_leading(state, competition, lambda text: progress(share + 0.7 * _SHARE, text))
+
+
+def _with_leading(state: Investigation, competition: _Competition, progress: Callable[[str], None]) -> Investigation:
+    """The investigation with the leading candidate as a finding; without it if it may be chance, or is refuted.
+
+    A candidate within the data sheet of its instrument is not a finding: all instruments are calibrated then.
+    """
     trials, note = with_formula(state, competition.findings, competition.leading)
     chosen = trials[0]
     p_value = _p_value(state, chosen)
@@ -76,7 +86,7 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
     state, trial = _refitted(state, chosen, trials)
     rivals = tuple(t for t in trials if t is not trial)
     found = Found(trial, rivals, second, p_value, tuple(t for t, _ in competition.implausible))
-    progress(share + 0.12, "screening the residual")
+    progress("screening the residual")
     last = screen(state.problem, state.fit, state.problem.system.catalogue, state.options.project)
     return replace(state, found=(*state.found, found), last=last, notes=(*state.notes, *note))
 

@@ -70,6 +70,17 @@ class HeldOutErrors:
         left = max(0.0, float(np.mean(self.after**2)) - floor)
         return float(np.clip(1 - left / excess, -1.0, 1.0)) if excess > 0 else None
 
+    def reject(self, rules: VerdictRules = RULES.verdict) -> bool:
+        """Whether the errors reject the model, whatever the noise."""
+        return float(np.sqrt(np.mean(self.after**2))) > rules.rejected
+
+    def outweigh_findings(self, rules: VerdictRules = RULES.verdict) -> bool:
+        """Whether more is left unexplained than findings with a name may leave."""
+        left = self.unexplained(rules)
+        share = self.explained(rules)
+        carried_too_little = bool(np.any(left > 0)) and share is not None and share < rules.carried
+        return carried_too_little or float(np.max(left, initial=0.0)) > rules.gross
+
 
 def verdict_of(
     kinds: Sequence[EffectKind],
@@ -86,18 +97,15 @@ def verdict_of(
     """
     if other_structure:
         return "unknown_physics"
+    kinds = [kind for kind in kinds if kind is not EffectKind.NUISANCE]
+    physics = [kind for kind in kinds if kind is not EffectKind.FAULT]
     left = bool(np.any(errors.unexplained(rules) > 0))
-    named = [kind for kind in kinds if kind is not EffectKind.NUISANCE]
-    faults_only = bool(named) and all(kind is EffectKind.FAULT for kind in named)
-    if float(np.sqrt(np.mean(errors.after**2))) > rules.rejected and (left or not faults_only):
-        return "unknown_physics"  # the model is rejected, whatever the noise
-    if not named:
-        return "unknown_physics" if left or ended else "consistent"
-    share = errors.explained(rules)
-    gross = float(np.max(errors.unexplained(rules), initial=0.0)) > rules.gross
-    if gross or (left and share is not None and share < rules.carried):
+    if errors.reject(rules) and (left or physics or not kinds):
         return "unknown_physics"
-    physics = [kind for kind in named if kind is not EffectKind.FAULT]
+    if not kinds:
+        return "unknown_physics" if left or ended else "consistent"
+    if errors.outweigh_findings(rules):
+        return "unknown_physics"
     if not physics:
         return "sensor_fault"
     return "unknown_physics" if physics[0] is EffectKind.UNLISTED else "missing_physics"

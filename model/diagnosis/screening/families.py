@@ -34,4 +34,3 @@ STRUCTURE = Family("structure", freedom=None, look_elsewhere=lambda rules: rules
 SENSOR = Family("sensor")
 INPUT = Family("input", rank=0)  # channels of supports, compensated before anything else
 FORCE = Family("force", rank=0)  # measured forces, fitted as a law is
-FAMILIES = (ELEMENT, UNNAMED, HARMONIC, LINE, MODE, MASS, PART, STRUCTURE, SENSOR, INPUT, FORCE)
