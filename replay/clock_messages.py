@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 
 from sprung.replay.windowing import Windower
 
-STRAY = {  # what `Windower.reasons` calls samples that belong to no window, and the message to users
+STRAY = {  # what `StreamAccount.reasons` calls samples that belong to no window, and the message to users
     "late": "too late",
     "stray time stamp": "at times of which no others are",
     "too many samples for their time": "at nearly the same time",
@@ -17,8 +17,8 @@ LONGEST_PAUSE = 30 * 86_400.0  # s; a longer pause within one recording is a clo
 def remarks(windower: Windower, windows: int) -> list[str]:
     """One line each; none when the clock ran on and windows could be made.  `windows`: how many came of it."""
     lines = []
-    back = [jump for jump in windower.jumps if jump.seconds < 0]
-    ahead = [jump for jump in windower.jumps if jump.seconds > LONGEST_PAUSE]
+    back = [jump for jump in windower.account.jumps if jump.seconds < 0]
+    ahead = [jump for jump in windower.account.jumps if jump.seconds > LONGEST_PAUSE]
     for jumps, verb in ((back, "steps back"), (ahead, "leaps ahead")):
         if jumps:
             times = f"{len(jumps)} times, first " if len(jumps) > 1 else ""
@@ -30,7 +30,7 @@ def remarks(windower: Windower, windows: int) -> list[str]:
 
 def pauses(windower: Windower) -> list[str]:
     """One line where nothing came for a while, or the clock leapt ahead; nothing that was recorded is missing."""
-    found = [jump for jump in windower.jumps if 0 < jump.seconds <= LONGEST_PAUSE]
+    found = [jump for jump in windower.account.jumps if 0 < jump.seconds <= LONGEST_PAUSE]
     if not found:
         return []
     longest = max(found, key=lambda jump: jump.seconds)
@@ -44,14 +44,16 @@ def pauses(windower: Windower) -> list[str]:
 def _none(windower: Windower) -> str:
     """Why no window could be made at all."""
     needed = windower.window / windower.sample_rate
-    stretches = len(windower.jumps) + 1
+    stretches = len(windower.account.jumps) + 1
     among = "" if stretches == 1 else f" without a jump of the clock, among {stretches},"
     lost = ", ".join(
-        f"{windower.reasons[name]} samples {words}" for name, words in STRAY.items() if windower.reasons[name]
+        f"{windower.account.reasons[name]} samples {words}"
+        for name, words in STRAY.items()
+        if windower.account.reasons[name]
     )
     return (
-        f"no window can be made of {windower.samples} samples: a window needs {needed:.3g} s, "
-        f"their longest stretch{among} is {windower.longest:.3g} s{', ' + lost if lost else ''}"
+        f"no window can be made of {windower.account.samples} samples: a window needs {needed:.3g} s, "
+        f"their longest stretch{among} is {windower.account.longest:.3g} s{', ' + lost if lost else ''}"
     )
 
 

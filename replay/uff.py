@@ -146,25 +146,41 @@ def _shape(lines: list[bytes]) -> tuple[int, int, bool]:
 
 def _function(lines: list[bytes], numbers: NDArray[np.float64]) -> _Function | None:
     """A time response; None for spectra, frequency responses and complex functions."""
-    text = [line.decode("latin-1") for line in lines]
     kind, count, even = _shape(lines)
-    function, abscissa = int(text[5][:5] or 0), int(text[7][:10] or 0)
-    if function not in (0, TIME_RESPONSE) or abscissa not in (0, TIME) or KINDS[kind][1] != 1:
+    text = [line.decode("latin-1") for line in lines]
+    if not _is_time_response(text, kind):
         return None
+    title, place, unit = _or_none(text[0].strip()) or "", _place(text[5]), _or_none(text[8][47:67].strip())
+    if even:
+        return _Function(title, place, unit, _even_times(text), None, numbers[:count])
+    pairs = numbers[: 2 * count].reshape(-1, 2)
+    return _Function(title, place, unit, None, pairs[:, 0], pairs[:, 1])
+
+
+def _is_time_response(text: list[str], kind: int) -> bool:
+    """Whether the function is real and over time, as far as its header states that."""
+    function, abscissa = int(text[5][:5] or 0), int(text[7][:10] or 0)
+    return function in (0, TIME_RESPONSE) and abscissa in (0, TIME) and KINDS[kind][1] == 1
+
+
+def _place(line: str) -> str:
+    """Node and direction of the response, `12+Z`."""
+    node, direction = int(line[41:51] or 0), int(line[51:55] or 0)
+    return f"{node}{DIRECTIONS.get(direction, '')}" if node else ""
+
+
+def _even_times(text: list[str]) -> EvenTimes:
+    """The clock of evenly spaced values."""
     first, step = float(text[6][30:43] or 0), float(text[6][43:56] or 0)
-    unit = text[8][47:67].strip() if len(text[8]) > 47 else ""
-    node, direction = int(text[5][41:51] or 0), int(text[5][51:55] or 0)
-    place = f"{node}{DIRECTIONS.get(direction, '')}" if node else ""
-    label = unit if unit.upper() != "NONE" else ""
-    title = text[0].strip() if text[0].strip().upper() != "NONE" else ""
-    began = _instant(text[2])
-    if not even:
-        pairs = numbers[: 2 * count].reshape(-1, 2)
-        return _Function(title, place, label or None, None, pairs[:, 0], pairs[:, 1])
     if not step > 0:
         raise ValueError("its time step is not positive")
-    clock = EvenTimes((began or 0) + round(first * SECOND), step, began is None)
-    return _Function(title, place, label or None, clock, None, numbers[:count])
+    began = _instant(text[2])
+    return EvenTimes((began or 0) + round(first * SECOND), step, began is None)
+
+
+def _or_none(word: str) -> str | None:
+    """A word of the header, in which NONE stands for none."""
+    return None if word.upper() in ("", "NONE") else word
 
 
 def _instant(text: str) -> int | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,19 @@ COHERENT = 0.5  # mean resultant length of the phases above which they have a co
 KEPT_JUMPS = 1000
 MOST_RATE = 100  # times the grid's rate: a stream of more samples than all channels give at this one stands still
 FEWEST_KEPT = 1_000_000  # samples that may wait in any case
+
+
+@dataclass(slots=True)
+class StreamAccount:
+    """Counts of a stream of samples and the windows made of it."""
+
+    reasons: Counter[str] = field(default_factory=Counter)  # windows repaired or dropped, samples dropped, by reason
+    jumps: list[ClockJump] = field(default_factory=list)  # of the clock, and pauses; the first ones
+    samples: int = 0  # that belonged to the stream
+    longest: float = 0.0  # s, the longest stretch of samples without a jump
+    recorded: float = 0.0  # s, of all stretches, from the first sample of each to the end of its last one
+    expected: int = 0  # samples that the emitted windows should hold, each counted once
+    lost: int = 0  # of these, samples that did not come or were invalid
 
 
 class Windower:
@@ -48,38 +61,26 @@ class Windower:
         consecutive samples and `largest_share` of a window's samples may be repaired; `delay`: s that samples may
         come out of order; `pause`: s of silence after which the grid starts anew; `stamped`: times are those
         of sampling, not of arrival, so that uneven ones can be interpolated between."""
-        self.channels = tuple(channels)
-        self.sample_rate = float(sample_rate)
-        self.window = int(window)
-        self.hop = int(hop) if hop else max(self.window // 2, 1)
-        if self.window < 4 or not self.sample_rate > 0:
+        if window < 4 or not sample_rate > 0:
             raise ValueError(f"a window needs at least 4 samples and a positive rate, not {window} at {sample_rate}")
-        names = [channel.name for channel in channels]
-        wanted = set(names[:inputs]) if isinstance(inputs, int) else set(inputs)
-        self.is_input = np.array([name in wanted for name in names])
-        self.longest_gap = longest_gap
-        self.largest_share = largest_share
-        self.order = Reorderer(delay, pause, confirm=max(8, 2 * len(names)))
-        self.delay, self.pause = delay, pause
-        self.stamped = stamped
-        self.reasons: Counter[str] = Counter()  # windows repaired or dropped, and samples dropped, by reason
-        self.jumps: list[ClockJump] = []  # of the clock, and pauses; the first ones
-        self.samples = 0  # that belonged to the stream
-        self.longest = 0.0  # s, the longest stretch of samples without a jump
-        self.recorded = 0.0  # s, of all stretches, from the first sample of each to the end of its last one
-        self.expected = 0  # samples that the emitted windows should hold, each counted once
-        self.lost = 0  # of these, samples that did not come or were invalid
+        self.channels, self.is_input = tuple(channels), _are_inputs(channels, inputs)
+        self.sample_rate, self.window = float(sample_rate), int(window)
+        self.hop = int(hop) if hop else max(self.window // 2, 1)
+        self.longest_gap, self.largest_share = longest_gap, largest_share
+        self.delay, self.pause, self.stamped = delay, pause, stamped
+        self.order = Reorderer(delay, pause, confirm=max(8, 2 * len(self.channels)))
+        self.account = StreamAccount()
         self._period = 1e9 / self.sample_rate  # ns
+        rows = self.window + (delay + pause) * self.sample_rate
+        self._most = max(FEWEST_KEPT, int(MOST_RATE * rows * len(self.channels)))  # samples in `_pending`
         self._pending: list[SampleBlock] = []
+        self._waiting = 0  # samples in `_pending`
         self._base = 0  # ns since epoch: the grid's first sample.  Floats hold differences to it only, because a
         self._origin: float | None = None  # float of an absolute time is 256 ns coarse.  ns of the next window's row 0
         self._stretch: tuple[int, int] | None = None  # ns, first and newest time of the stretch without a jump
         self._overlap = (0, 0)  # samples and lost samples of the last window that the next one shares
         self._first_row = True  # the next window is the first of its grid: nothing lies before it
         self._new_segment = False  # the next window is the first after a jump
-        rows = self.window + (delay + pause) * self.sample_rate
-        self._most = max(FEWEST_KEPT, int(MOST_RATE * rows * len(names)))
-        self._waiting = 0  # samples in `_pending`
 
     def push(self, block: SampleBlock) -> list[Window]:
         """Windows that this block completed."""
@@ -88,20 +89,20 @@ class Windower:
             if isinstance(piece, ClockJump):
                 out += self._finish()
                 self._end_stretch()
-                self.reasons["clock jump" if piece.seconds < 0 else "pause or clock jump"] += 1
+                self.account.reasons["clock jump" if piece.seconds < 0 else "pause or clock jump"] += 1
                 self._new_segment = True
-                if len(self.jumps) < KEPT_JUMPS:
-                    self.jumps.append(piece)
+                if len(self.account.jumps) < KEPT_JUMPS:
+                    self.account.jumps.append(piece)
                 continue
             self._pending.append(piece)
             self._waiting += len(piece.time)
-            self.samples += len(piece.time)
+            self.account.samples += len(piece.time)
             if self._origin is None:
                 self._base, self._origin = int(piece.time[0]), 0.0
             begun, newest = self._stretch or (int(piece.time[0]),) * 2
             self._stretch = begun, max(newest, int(piece.time.max()))
             if self._waiting > self._most:  # time stands still, or nearly
-                self.reasons["too many samples for their time"] += self._waiting
+                self.account.reasons["too many samples for their time"] += self._waiting
                 self._forget_all()
         if self._origin is not None and self.order.newest is not None:
             horizon = self.order.newest - self._base - self.delay * 1e9
@@ -112,7 +113,7 @@ class Windower:
     def flush(self) -> list[Window]:
         """At the end of the stream: the windows that are still whole."""
         self.order.flush()
-        self.reasons.update(self.order.counts)
+        self.account.reasons.update(self.order.counts)
         self.order.counts.clear()
         self._end_stretch()
         return self._finish()
@@ -120,8 +121,8 @@ class Windower:
     def _end_stretch(self) -> None:
         if self._stretch is not None:
             begun, newest = self._stretch
-            self.longest = max(self.longest, (newest - begun) / 1e9)
-            self.recorded += (newest - begun + self._period) / 1e9
+            self.account.longest = max(self.account.longest, (newest - begun) / 1e9)
+            self.account.recorded += (newest - begun + self._period) / 1e9
         self._stretch = None
 
     def _finish(self) -> list[Window]:
@@ -131,8 +132,8 @@ class Windower:
             last = max(int(block.time.max()) for block in self._pending if len(block.time)) - self._base
             rows = int(np.rint((last - self._origin) / self._period)) + 1
             out = self._emit(rows, ended=True)
-        self.expected += self._overlap[0]
-        self.lost += self._overlap[1]
+        self.account.expected += self._overlap[0]
+        self.account.lost += self._overlap[1]
         self._forget_all()
         return out
 
@@ -164,8 +165,8 @@ class Windower:
 
     def _count(self, gone: BoolArray) -> None:
         """Count every sample once: a window answers for its first `hop` rows, the last one for all of them."""
-        self.expected += gone[: self.hop].size
-        self.lost += int(gone[: self.hop].sum())
+        self.account.expected += gone[: self.hop].size
+        self.account.lost += int(gone[: self.hop].sum())
         self._overlap = (gone[self.hop :].size, int(gone[self.hop :].sum()))
 
     def _gather(self) -> SampleBlock:
@@ -184,6 +185,13 @@ class Windower:
         keep = samples.time - self._base >= oldest
         self._pending = [SampleBlock(samples.time[keep], samples.channel[keep], samples.value[keep])]
         self._waiting = int(keep.sum())
+
+
+def _are_inputs(channels: Sequence[Channel], inputs: frozenset[str] | int) -> BoolArray:
+    """Which channels (C,) are inputs, by their names or as the number of leading ones."""
+    names = [channel.name for channel in channels]
+    wanted = set(names[:inputs]) if isinstance(inputs, int) else inputs
+    return np.array([name in wanted for name in names])
 
 
 class _Batch:
@@ -256,13 +264,13 @@ class _Batch:
         start = owner._base + round(self.origin + index * owner.hop * owner._period)
         reason = self._reason(absent, missing, unfilled, conflict, notes)
         if reason:
-            owner.reasons[reason] += 1
+            owner.account.reasons[reason] += 1
             return Window(start, owner.sample_rate, values, "dropped", reason)
         repaired = int(missing[~absent].sum())
         if repaired:
             notes.insert(0, "missing samples interpolated")
         if notes:
-            owner.reasons[notes[0]] += 1
+            owner.account.reasons[notes[0]] += 1
             return Window(start, owner.sample_rate, values, "repaired", "; ".join(notes[:4]), repaired)
         return Window(start, owner.sample_rate, values)
 

@@ -125,9 +125,9 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
         recording.vehicle,
         [*said, *recording.problems, *pauses(windower)],
         recording.incomplete or bool(said),
-        windower.expected,
-        windower.lost,
-        round(windower.recorded, 3),
+        windower.account.expected,
+        windower.account.lost,
+        round(windower.account.recorded, 3),
         windower.order.newest,
     )
 

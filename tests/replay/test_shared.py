@@ -60,7 +60,7 @@ def test_every_recording_is_read_whole(pattern: str) -> None:
         assert recording.vehicle == ("demo-0001" if name.endswith("mcap") else None)
         assert Counter(w.outcome for w in windows) == {"used": 119}
         assert windows[0].start == 1_790_000_000_000_000_000
-        assert windower.lost == 0
+        assert windower.account.lost == 0
 
 
 def test_the_ten_minutes_are_whole_and_on_the_cycle() -> None:
@@ -68,21 +68,21 @@ def test_the_ten_minutes_are_whole_and_on_the_cycle() -> None:
     assert recording.tally.used == 420_000
     assert [w.start for w in windows] == [1_790_000_000_000_000_000 + i * 500_000_000 for i in range(1199)]
     assert {w.outcome for w in windows} == {"used"}
-    assert windower.expected == 600 * 100 * 28
+    assert windower.account.expected == 600 * 100 * 28
 
 
 @pytest.mark.parametrize("name", ["lossy-30s.mcap", "lossy-30s.blf"])
 def test_every_lost_message_of_the_lossy_recordings_is_counted(name: str) -> None:
     recording, windower, windows = windows_of(RECORDINGS / name)
     came = recording.tally.used
-    assert windower.expected == 3000 * 28
-    assert windower.lost == 4 * (3000 * 7 - came)
-    assert 0.01 < windower.lost / windower.expected < 0.03
+    assert windower.account.expected == 3000 * 28
+    assert windower.account.lost == 4 * (3000 * 7 - came)
+    assert 0.01 < windower.account.lost / windower.account.expected < 0.03
     assert {w.outcome for w in windows} <= {"repaired", "dropped"}
     foreign = recording.tally.foreign
     assert foreign == (0 if name.endswith("mcap") else 1007)
     repaired = sum(w.repaired_samples for w in windows if w.outcome == "repaired")
-    assert repaired > 1.5 * windower.lost  # each lies in two windows, but for dropped ones
+    assert repaired > 1.5 * windower.account.lost  # each lies in two windows, but for dropped ones
 
 
 def test_repaired_samples_are_close_to_the_lost_ones() -> None:

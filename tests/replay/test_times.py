@@ -53,7 +53,7 @@ def test_a_clock_that_is_set_begins_a_new_segment(step: float) -> None:
     assert sum(first) == 1
     assert abs(first.index(True) - len(windows) / 2) <= 1
     assert len(windows) >= 36
-    assert abs(windower.jumps[0].seconds - step) < 0.1
+    assert abs(windower.account.jumps[0].seconds - step) < 0.1
     told = remarks(windower, len(windows))
     if step < 0:
         assert "the clock steps back by" in told[0]
@@ -91,7 +91,7 @@ def test_a_stream_whose_time_stands_still_stays_small() -> None:
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 60e6
-    assert windower.reasons["too many samples for their time"] > 1_000_000
+    assert windower.account.reasons["too many samples for their time"] > 1_000_000
 
 
 def test_a_record_that_is_nearly_all_gaps_is_refused(tmp_path: Path) -> None:
@@ -127,4 +127,4 @@ def test_any_times_give_windows_in_time_and_memory(runs: list[tuple[int, int, in
         assert window.values.shape == (100, 2)
         assert EARLIEST <= window.start <= LATEST
     assert all("\n" not in line for line in remarks(windower, len(windows)))
-    assert windower.lost <= windower.expected
+    assert windower.account.lost <= windower.account.expected

@@ -77,7 +77,7 @@ def test_samples_on_the_grid_pass_unchanged() -> None:
         assert window.outcome == "used"
         seconds = (window.start - START) / 1e9 + np.arange(100) / RATE
         assert np.abs(window.values - expected(window)).max() < 1e-12, seconds
-    assert (windower.expected, windower.lost) == (1200, 0)
+    assert (windower.account.expected, windower.account.lost) == (1200, 0)
 
 
 def test_jitter_and_bus_order_within_a_quarter_period_do_not_smear() -> None:
@@ -182,7 +182,7 @@ def test_isolated_lost_samples_are_interpolated_marked_and_counted() -> None:
     assert [w.outcome for w in windows] == ["used", "repaired", "repaired", "repaired", "used", "used", "used"]
     assert [w.repaired_samples for w in windows] == [0, 2, 4, 2, 0, 0, 0]
     assert all(np.abs(w.values - expected(w)).max() < 0.02 for w in windows)
-    assert (windower.expected, windower.lost) == (1200, 4)
+    assert (windower.account.expected, windower.account.lost) == (1200, 4)
 
 
 def test_invalid_values_are_missing_samples() -> None:
@@ -190,7 +190,7 @@ def test_invalid_values_are_missing_samples() -> None:
     invalid = (block.channel == 1) & (np.rint((block.time - START) / 1e7) == 130)
     windower, windows = windows_of(replace(block, value=np.where(invalid, np.nan, block.value)))
     assert [w.outcome for w in windows].count("repaired") == 2
-    assert windower.lost == 1
+    assert windower.account.lost == 1
 
 
 @pytest.mark.parametrize("phase", [0.002, 0.0045, 0.005])
@@ -199,7 +199,7 @@ def test_every_lost_sample_counts_once_whatever_the_phase_of_its_channel(phase: 
     seconds = even()
     seconds[1] = np.delete(seconds[1] + phase, [50, 150, 151, 152, 153])
     windower, _ = windows_of(stream(seconds))
-    assert windower.lost == 5
+    assert windower.account.lost == 5
 
 
 def test_a_longer_gap_drops_the_windows_that_hold_it_and_no_other() -> None:
@@ -208,7 +208,7 @@ def test_a_longer_gap_drops_the_windows_that_hold_it_and_no_other() -> None:
     windower, windows = windows_of(without(block, (block.channel == 2) & (row >= 120) & (row < 123)))
     assert [w.outcome for w in windows] == ["used", "dropped", "dropped", "used", "used", "used", "used"]
     assert windows[1].reason == "gap in axle"
-    assert windower.reasons["gap in axle"] == 2
+    assert windower.account.reasons["gap in axle"] == 2
 
 
 def test_too_many_lost_samples_drop_a_window() -> None:
@@ -227,7 +227,7 @@ def test_an_absent_sensor_is_a_nan_column_and_an_absent_input_drops_the_window()
     assert all(np.isnan(w.values[:, 2]).all() and np.isfinite(w.values[:, :2]).all() for w in windows)
     windower, windows = windows_of(without(block, block.channel == 0))
     assert {(w.outcome, w.reason) for w in windows} == {("dropped", "missing input road")}
-    assert windower.reasons["missing input road"] == len(windows)
+    assert windower.account.reasons["missing input road"] == len(windows)
 
 
 def test_duplicates_and_samples_out_of_order_within_the_delay_change_nothing() -> None:
@@ -241,7 +241,7 @@ def test_duplicates_and_samples_out_of_order_within_the_delay_change_nothing() -
     mixed = SampleBlock(block.time[shuffled], block.channel[shuffled], block.value[shuffled])
     windower, windows = windows_of(mixed)
     assert all(same(a, b) for a, b in zip(windows, reference, strict=True))
-    assert not windower.reasons
+    assert not windower.account.reasons
 
 
 def test_late_samples_are_dropped_and_counted() -> None:
@@ -249,7 +249,7 @@ def test_late_samples_are_dropped_and_counted() -> None:
     arrival = [s.copy() for s in seconds]
     arrival[1][150] += 1.0
     windower, windows = windows_of(stream(seconds, order=arrival))
-    assert windower.reasons["late"] == 1
+    assert windower.account.reasons["late"] == 1
     assert [w.repaired_samples for w in windows] == [0, 0, 1, 1, 0, 0, 0][: len(windows)]
 
 
@@ -262,8 +262,8 @@ def test_a_clock_jump_restarts_the_grid(jump: float) -> None:
     assert {w.outcome for w in windows} == {"used"}
     assert len(windows) == 10
     assert windows[5].start == START + int((3.0 + jump) * 1e9)
-    assert sum(count for reason, count in windower.reasons.items() if "clock jump" in reason) == 1
-    assert windower.recorded == pytest.approx(6.0)
+    assert sum(count for reason, count in windower.account.reasons.items() if "clock jump" in reason) == 1
+    assert windower.account.recorded == pytest.approx(6.0)
 
 
 def test_a_small_step_back_of_the_clock_is_not_taken_for_duplicates() -> None:
@@ -281,10 +281,10 @@ def test_a_stray_time_stamp_does_not_stop_the_stream() -> None:
     stamps[500] = 4 * START
     stamps[700] = 0
     windower, windows = windows_of(replace(block, time=stamps))
-    assert windower.reasons["stray time stamp"] == 1
-    assert windower.reasons["late"] == 1
+    assert windower.account.reasons["stray time stamp"] == 1
+    assert windower.account.reasons["late"] == 1
     assert len(windows) == 7
-    assert windower.recorded == pytest.approx(4.0)  # and not the years to the stray one
+    assert windower.account.recorded == pytest.approx(4.0)  # and not the years to the stray one
 
 
 def test_the_grid_follows_a_clock_that_drifts() -> None:
