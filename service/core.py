@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -121,26 +121,15 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
 
     Raises UserError when the store cannot be opened.
     """
-    store = open_store(settings.store_url)
-    archive = open_archive(settings.archive)
+    store, archive = open_store(settings.store_url), open_archive(settings.archive)
     board = Board(engine, settings.vehicles_in_memory)
     metrics = Metrics(board, settings.parameter_series_vehicles, partial(fleet_counts, store))
     waits = Waits(metrics.registry)
     store.on_wait = waits.of("store")
-    compute = Compute(settings.compute_queue, waits.of("numerics"))
-    beside = Compute(settings.compute_queue, waits.of("own models"))
-    rides = Rides(settings.parameter_series_vehicles)
-    metrics.registry.register(RideCollector(rides))
-
-    def forget(vehicle: str) -> None:
-        board.forget(vehicle)
-        rides.forget(vehicle)
-
-    rings = Rings(settings.ring_vehicles, settings.ring_seconds, len(engine.system.channels), engine.system.sample_rate)
-    hub = Hub()
-    listeners: list[Callable[[Batch], None]] = [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
     feeds: list[LiveFeed] = []
     notices = Notices(settings, store, lambda: [feed.status() for feed in feeds])
+    compute, beside = (Compute(settings.compute_queue, waits.of(queue)) for queue in ("numerics", "own models"))
+    listeners: list[Callable[[Batch], None]] = []
     pipeline = Pipeline(
         engine,
         store,
@@ -151,44 +140,57 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         follow=following,
         beside=beside,
     )
+    rings = Rings(settings.ring_vehicles, settings.ring_seconds, len(engine.system.channels), engine.system.sample_rate)
+    rides, hub, alarm_signals = Rides(settings.parameter_series_vehicles), Hub(), AlarmSignals(settings, store, rings)
+    metrics.registry.register(RideCollector(rides))
     diagnosis_jobs = DiagnosisJobs(settings, pipeline, on_report=notices.report)
     jobs = _jobs(settings, pipeline, metrics, diagnosis_jobs, waits)
     diagnoses = Diagnoses(settings, store, rings, jobs)
-    alarm_signals = AlarmSignals(settings, store, rings)
+    listeners += [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
     listeners += [rides.on_batch, diagnoses.on_batch, alarm_signals.on_batch, hub.on_batch]
-    of_own_models = Batcher(pipeline, beside, settings.compute_queue, metrics.observe)
-    batcher = Batcher(pipeline, compute, settings.compute_queue, metrics.observe, of_own_models)
     core = Core(
-        settings,
-        engine,
-        store,
-        compute,
-        beside,
-        pipeline,
-        board,
-        rides,
-        metrics,
-        jobs,
-        diagnoses,
-        diagnosis_jobs,
-        alarm_signals,
-        Housekeeping(settings, store),
-        hub,
-        Condition(settings, store),
-        Operations(settings, pipeline, forget, archive),
-        batcher,
-        notices,
-        Tokens(store, None if settings.admin_token is None else settings.admin_token.get_secret_value()),
-        threading.Event(),
-        Ingest(pipeline, settings.late_seconds),
-        FleetTelling(engine, store, pipeline.model_id),
-        UploadRoom(settings, store),
-        waits,
-        archive,
-        provider_of(settings),
-        feeds,
+        settings=settings,
+        engine=engine,
+        store=store,
+        compute=compute,
+        beside=beside,
+        pipeline=pipeline,
+        board=board,
+        rides=rides,
+        metrics=metrics,
+        jobs=jobs,
+        diagnoses=diagnoses,
+        diagnosis_jobs=diagnosis_jobs,
+        alarm_signals=alarm_signals,
+        housekeeping=Housekeeping(settings, store),
+        hub=hub,
+        condition=Condition(settings, store),
+        operations=Operations(settings, pipeline, partial(_forget, (board, rides)), archive),
+        batcher=_batcher(settings, pipeline, compute, beside, metrics),
+        notices=notices,
+        tokens=Tokens(store, None if settings.admin_token is None else settings.admin_token.get_secret_value()),
+        stopping=threading.Event(),
+        ingest=Ingest(pipeline, settings.late_seconds),
+        telling=FleetTelling(engine, store, pipeline.model_id),
+        upload_room=UploadRoom(settings, store),
+        waits=waits,
+        archive=archive,
+        oidc=provider_of(settings),
+        feeds=feeds,
     )
     return _observed(core)
+
+
+def _forget(kept: Sequence[Board | Rides], vehicle: str) -> None:
+    """Drop what is kept in memory of a vehicle."""
+    for one in kept:
+        one.forget(vehicle)
+
+
+def _batcher(settings: Settings, pipeline: Pipeline, compute: Compute, beside: Compute, metrics: Metrics) -> Batcher:
+    """Windows of many vehicles that arrive together; those of vehicles with a model of their own wait apart."""
+    of_own_models = Batcher(pipeline, beside, settings.compute_queue, metrics.observe)
+    return Batcher(pipeline, compute, settings.compute_queue, metrics.observe, of_own_models)
 
 
 def _observed(core: Core) -> Core:

@@ -42,23 +42,8 @@ class LinearFmu:
 def read_fmu(path: Path) -> LinearFmu:
     """Linearise an FMU.  Errors: `ExchangeError`, one line."""
     fmpy, fmi2 = _fmpy()
-    try:
-        description = fmpy.read_model_description(str(path))
-    except Exception as error:  # whatever a broken archive or description raises there
-        raise ExchangeError(f"{path}: no FMU that can be read: {' '.join(str(error).split())[:150]}") from error
-    exchange = description.modelExchange
-    if not str(description.fmiVersion).startswith("2.") or exchange is None:
-        raise ExchangeError(f"{path}: an FMU of FMI 2.0 for model exchange is needed")
-    if not exchange.providesDirectionalDerivative:
-        raise ExchangeError(f"{path}: the FMU gives no directional derivatives; export it with them")
-    derivatives = [unknown.variable for unknown in description.derivatives]
-    states = [variable.derivative for variable in derivatives]
-    inputs = [v for v in description.modelVariables if v.causality == "input" and v.type == "Real"]
-    outputs = [v for v in description.modelVariables if v.causality == "output" and v.type == "Real"]
-    if not states or not inputs or not outputs:
-        raise ExchangeError(
-            f"{path}: states, inputs and outputs are needed; it has {len(states)}, {len(inputs)}, {len(outputs)}"
-        )
+    description = _linearisable(path, fmpy)
+    derivatives, states, inputs, outputs = _variables(path, description)
     rows = [v.valueReference for v in (*derivatives, *outputs)]
     columns = [v.valueReference for v in (*states, *inputs)]
     found = _derivatives(path, fmpy, fmi2, description, rows, columns)
@@ -70,6 +55,33 @@ def read_fmu(path: Path) -> LinearFmu:
         [v.name for v in inputs],
         tuple(v.name for v in outputs),
     )
+
+
+def _linearisable(path: Path, fmpy: Any) -> Any:
+    """The description of an FMU for model exchange with directional derivatives."""
+    try:
+        description = fmpy.read_model_description(str(path))
+    except Exception as error:  # whatever a broken archive or description raises there
+        raise ExchangeError(f"{path}: no FMU that can be read: {' '.join(str(error).split())[:150]}") from error
+    exchange = description.modelExchange
+    if not str(description.fmiVersion).startswith("2.") or exchange is None:
+        raise ExchangeError(f"{path}: an FMU of FMI 2.0 for model exchange is needed")
+    if not exchange.providesDirectionalDerivative:
+        raise ExchangeError(f"{path}: the FMU gives no directional derivatives; export it with them")
+    return description
+
+
+def _variables(path: Path, description: Any) -> tuple[list[Any], list[Any], list[Any], list[Any]]:
+    """Derivatives of the states, states, inputs and outputs."""
+    derivatives = [unknown.variable for unknown in description.derivatives]
+    states = [variable.derivative for variable in derivatives]
+    inputs = [v for v in description.modelVariables if v.causality == "input" and v.type == "Real"]
+    outputs = [v for v in description.modelVariables if v.causality == "output" and v.type == "Real"]
+    if not states or not inputs or not outputs:
+        raise ExchangeError(
+            f"{path}: states, inputs and outputs are needed; it has {len(states)}, {len(inputs)}, {len(outputs)}"
+        )
+    return derivatives, states, inputs, outputs
 
 
 def _fmpy() -> tuple[Any, Any]:

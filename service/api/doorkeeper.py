@@ -62,7 +62,6 @@ class Doorkeeper:
         self._open: dict[Connection, None] = {}
         self._clients: Counter[str] = Counter()
         self.lingering = 0
-        self.evicted = 0
         self.refused = 0
 
     def __len__(self) -> int:
@@ -139,7 +138,6 @@ class Doorkeeper:
         return [connection for connection in self._open if connection.host == host]
 
     def _evict(self, connection: Connection) -> None:
-        self.evicted += 1
         connection.end()
         self.leave(connection)
 

@@ -20,7 +20,7 @@ from sprung.service.cli import apart
 from sprung.service.cli.replay import readable
 from sprung.service.errors import UserError
 from sprung.service.fleet.nats_broker import NatsLink
-from sprung.service.fleet.onboard import Onboard, OnboardSettings
+from sprung.service.fleet.onboard import Onboard, OnboardCounts, OnboardSettings
 from sprung.service.fleet.sending import HttpLink, Link, LinksByKind, Sending
 from sprung.service.fleet.spool import Spool
 from sprung.service.monitoring.engine import Engine, load_engine
@@ -55,63 +55,85 @@ class Destination:
         return LinksByKind(link, HttpLink(self.recordings, self.token, vehicle, "--recordings"))
 
 
-def run(
-    options: dict[str, Any],
-    files: list[Path],
-    bus: str | None,
-    destination: Destination,
-    vehicle: str | None,
-    spool_file: Path | None,
-    spool_bytes: int,
-    speed: float,
-    rates: OnboardSettings,
-    json_lines: bool,
-) -> int:
+@dataclass(frozen=True, slots=True)
+class EdgeRequest:
+    """What `sprung edge` is asked to do."""
+
+    settings: dict[str, Any]  # of the service, that replace those of the environment
+    files: list[Path]  # recordings, or
+    bus: str | None  # the bus to follow
+    destination: Destination
+    vehicle: str | None  # what it is called; None: as its first file or the bus
+    spool: Path | None  # file of messages that wait; None: in the data folder
+    spool_bytes: int
+    speed: float  # of recordings, times real time; 0: no pause
+    rates: OnboardSettings
+
+
+def run(request: EdgeRequest, json_lines: bool) -> int:
     """Identify on board and send, until the files end or it is stopped."""
-    if bool(files) == (bus is not None):
-        raise UserError("give recordings or --can, one of both")
-    for path in files:
-        readable(path)
-    if destination.broker and destination.recordings is None:
-        rates = replace(rates, raw_seconds=0.0)  # a broker takes estimates only
-    settings = settings_with(options)
+    _check(request)
+    settings = settings_with(request.settings)
     set_up(settings.log_format, settings.log_level)
     engine = load_engine(settings)
-    name = vehicle_of(vehicle, None, files[0].name if files else (bus or ""))
+    name = vehicle_of(request.vehicle, None, request.files[0].name if request.files else (request.bus or ""))
     started, cpu = time.perf_counter(), time.process_time()
     with ExitStack() as stack:
-        spool = Spool(spool_file or settings.data_dir / "edge.db", spool_bytes)
+        spool = Spool(request.spool or settings.data_dir / "edge.db", request.spool_bytes)
         stack.callback(spool.close)
-        link = destination.link(name)
+        link = request.destination.link(name)
         stack.callback(link.close)
         sending = Sending(spool, link)
-        onboard = Onboard(engine, name, spool, rates)
+        onboard = Onboard(engine, name, spool, _rates(request))
         sending.start()
         stack.callback(sending.stop)  # whatever ends it: the spool is closed next
-        if files:
-            _from_files(onboard, engine, files, name, speed, sending)
+        if request.files:
+            _from_files(onboard, engine, request.files, name, request.speed, sending)
         else:
-            _from_bus(onboard, engine, bus or "", name, settings)
+            _from_bus(onboard, engine, request.bus or "", name, settings)
         onboard.flush()
         empty = sending.close(LAST_SECONDS)
     seconds = onboard.counts.windows * engine.system.hop / engine.system.sample_rate
-    told = {
-        "vehicle": name,
-        "windows": onboard.counts.windows,
-        "alarms": onboard.counts.alarms,
-        "messages": onboard.counts.messages,
-        "recordings": onboard.counts.raw_files,
-        "sent": sending.sent,
-        "refused": sending.refused,
-        "given_up": onboard.counts.made_room,
-        "waiting": spool_left(sending, empty),
-        "estimate_bytes_per_second": round(onboard.counts.message_bytes / seconds, 1) if seconds else None,
-        "raw_bytes": onboard.counts.raw_bytes,
-        "cpu_share": round((time.process_time() - cpu) / seconds, 4) if seconds else None,
-        "wall_seconds": round(time.perf_counter() - started, 1),
-    }
+    took = time.perf_counter() - started, time.process_time() - cpu
+    told = _summary(name, onboard.counts, sending, spool_left(sending, empty), seconds, took)
     print(json.dumps({"edge": told}) if json_lines else _line(told), flush=True)
     return 0 if empty and not sending.refused and not onboard.counts.made_room else 1
+
+
+def _check(request: EdgeRequest) -> None:
+    if bool(request.files) == (request.bus is not None):
+        raise UserError("give recordings or --can, one of both")
+    for path in request.files:
+        readable(path)
+
+
+def _rates(request: EdgeRequest) -> OnboardSettings:
+    """What is sent how often; a broker takes estimates only."""
+    if request.destination.broker and request.destination.recordings is None:
+        return replace(request.rates, raw_seconds=0.0)
+    return request.rates
+
+
+def _summary(
+    name: str, counts: OnboardCounts, sending: Sending, waiting: str, seconds: float, took: tuple[float, float]
+) -> dict[str, Any]:
+    """What became of the windows; seconds: of recording; took: seconds of the wall clock, and of the processor."""
+    wall, cpu = took
+    return {
+        "vehicle": name,
+        "windows": counts.windows,
+        "alarms": counts.alarms,
+        "messages": counts.messages,
+        "recordings": counts.raw_files,
+        "sent": sending.sent,
+        "refused": sending.refused,
+        "given_up": counts.made_room,
+        "waiting": waiting,
+        "estimate_bytes_per_second": round(counts.message_bytes / seconds, 1) if seconds else None,
+        "raw_bytes": counts.raw_bytes,
+        "cpu_share": round(cpu / seconds, 4) if seconds else None,
+        "wall_seconds": round(wall, 1),
+    }
 
 
 def spool_left(sending: Sending, empty: bool) -> str:

@@ -65,13 +65,14 @@ def edge(
     raw samples are kept for a broker.
     """
     one_thread_each()
-    from sprung.service.cli.edge import Destination, run
+    from sprung.service.cli.edge import Destination, EdgeRequest, run
     from sprung.service.fleet.onboard import OnboardSettings
 
     rates = OnboardSettings(message_seconds=message_seconds, weigh_seconds=weigh_seconds, raw_seconds=raw_seconds)
     options: dict[str, Any] = {"system": system, "dbc": dbc, "weights": weights}
     destination = Destination(server, recordings, token)
-    return run(options, files or [], can, destination, vehicle, spool, spool_bytes, speed, rates, json_lines)
+    request = EdgeRequest(options, files or [], can, destination, vehicle, spool, spool_bytes, speed, rates)
+    return run(request, json_lines)
 
 
 @fleet.command("backfill")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,13 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from sprung.model.diagnosis.report.report import IdentifiedLaw, Report, ReportedParameter
+from sprung.model.diagnosis.response.terms import WIDER
 from sprung.model.laws import ElementLaw, SensorLaw, StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_NOISE
 from sprung.model.system import System, parse_system
 
 _DIGITS = 6
+_GROUPS = ("elements", "bodies", "inputs", "sensors")  # of a system file, whose entries have laws
 QUANTITIES = ("stiffness", "damping", "mass")
 
 
@@ -29,19 +31,34 @@ def improved_text(text: str, system: System, report: Report) -> str:
     yaml = YAML()
     yaml.width = 4096
     file = yaml.load(text)
-    for parameter in _parameters(system, report):
+    _write_parameters(file, _parameters(system, report))
+    _write_laws(file, system, report)
+    _write_noise(file, report)
+    out = io.StringIO()
+    yaml.dump(file, out)
+    return out.getvalue()
+
+
+def _write_parameters(file: Any, parameters: Iterable[ReportedParameter]) -> None:
+    for parameter in parameters:
         part, _, quantity = parameter.name.rpartition(".")
-        if quantity not in QUANTITIES:  # the preload of a component test: written as a law
-            continue
-        group = file["bodies" if quantity == "mass" else "elements"]
-        _set_value(group[part], quantity, parameter.value)
+        if quantity in QUANTITIES:  # the preload of a component test is written as a law
+            _set_value(file["bodies" if quantity == "mass" else "elements"][part], quantity, parameter.value)
+
+
+def _write_laws(file: Any, system: System, report: Report) -> None:
+    """The laws of a report in place of those that the file has; which values it holds fixed stay so."""
     undone = {law.name for law in system.catalogue if isinstance(law, SensorLaw)}
-    for group in ("elements", "bodies", "inputs", "sensors"):
+    for group in _GROUPS:
         for entry in (file.get(group) or {}).values():
             _drop_laws(entry, undone)
     held = {name for law in system.laws for name, fixed in zip(law.names, law.fixed, strict=True) if fixed}
     for law in report.laws:
         _place(file, system, law, held)
+
+
+def _write_noise(file: Any, report: Report) -> None:
+    """Noise of channels that are noisier than their peers, and of all whose level was estimated."""
     for finding in report.findings:
         if finding.effect == SENSOR_NOISE.name and finding.parameters:
             for name in finding.location.split("|"):
@@ -52,9 +69,6 @@ def improved_text(text: str, system: System, report: Report) -> str:
         channel = _channel(file, name)
         if channel is not None and level > 0:
             channel["noise"] = _rounded(level)
-    out = io.StringIO()
-    yaml.dump(file, out)
-    return out.getvalue()
 
 
 def _parameters(system: System, report: Report) -> tuple[ReportedParameter, ...]:
@@ -102,36 +116,42 @@ def _drop_laws(entry: Any, undone: set[str]) -> None:
 
 def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> None:
     """Add a law; held: full names of values that the file holds fixed."""
-    names = law.location.split("|")
-    entry = _holder(file, names[0])
+    first, *others = law.location.split("|")
+    entry = _holder(file, first)
     if entry is None:
         return
-    values = CommentedMap({name: text for name in ("formula", "memory") if (text := getattr(law, name))})
+    setting = CommentedMap({name: text for name in ("formula", "memory") if (text := getattr(law, name))})
+    setting.update(_law_values(system, law, held))
+    if law.variant and law.variant != WIDER:
+        setting["variant"] = law.variant
+    if others:
+        setting["with"] = others[0]
+    setting.fa.set_flow_style()
+    placed = CommentedMap({law.effect: setting})
+    placed.fa.set_flow_style()
+    entry.setdefault("laws", CommentedSeq()).append(placed)
+
+
+def _law_values(system: System, law: IdentifiedLaw, held: set[str]) -> dict[str, CommentedMap]:
+    """The values of a law's parameters as the file has them: with deviation, and whether they are fixed."""
     known = next((one for one in system.catalogue if one.name == law.effect), None)
     corner = known.corner if isinstance(known, ElementLaw) else None
+    values = {}
     for index, parameter in enumerate(law.parameters):
-        setting = CommentedMap(value=_rounded(parameter.value))
+        value = CommentedMap(value=_rounded(parameter.value))
         if parameter.std > 0:
-            setting["std"] = float(f"{parameter.std:.3g}")
+            value["std"] = float(f"{parameter.std:.3g}")
         # identifiable from a minute of running, but not from a window
         if index == corner or f"{law.location}.{law.effect}.{parameter.name}" in held:
-            setting["fixed"] = True
-        setting.fa.set_flow_style()
-        values[parameter.name] = setting
-    if law.variant and law.variant != "wider":
-        values["variant"] = law.variant
-    if len(names) == 2:
-        values["with"] = names[1]
-    values.fa.set_flow_style()
-    placed = entry.setdefault("laws", CommentedSeq())
-    made = CommentedMap({law.effect: values})
-    made.fa.set_flow_style()
-    placed.append(made)
+            value["fixed"] = True
+        value.fa.set_flow_style()
+        values[parameter.name] = value
+    return values
 
 
 def _holder(file: Any, name: str) -> Any:
     """The entry of the file that a law belongs to."""
-    for group in ("elements", "bodies", "inputs", "sensors"):
+    for group in _GROUPS:
         if name in (file.get(group) or {}):
             return file[group][name]
     return _channel(file, name)

@@ -53,7 +53,6 @@ class HttpLink:
         self._vehicle = vehicle
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         self._open: http.client.HTTPConnection | None = None
-        self.sent_bytes = 0  # bodies and what stands around them
 
     def send(self, entry: SpoolEntry) -> Answer:
         """One attempt."""
@@ -87,7 +86,6 @@ class HttpLink:
         connection.request("POST", self._parts.path.rstrip("/") + path, body, headers)
         response = connection.getresponse()
         text = response.read().decode(errors="replace")
-        self.sent_bytes += len(body) + sum(len(n) + len(v) + 4 for n, v in headers.items()) + len(path) + 80
         wait = response.headers.get("Retry-After", "0")
         return response.status, float(wait) if wait.isdigit() else 0.0, " ".join(text.split())[:300]
 

@@ -18,7 +18,7 @@ from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import Batch, Identified
 from sprung.service.processes.worker import ProcessLimits
-from sprung.service.sources.reading import Ending, ReadRequest, prefetched, reading_of
+from sprung.service.sources.reading import Ending, Reading, ReadRequest, prefetched, reading_of
 from sprung.service.times import AHEAD, now_ns, to_iso
 
 MOST_MINUTES = 1440  # of comfort that a summary keeps
@@ -109,29 +109,18 @@ def feed_file(
     check: called while waiting; this stops with whatever it or `on_batch` raises, batches before are stored.
     Raises UnreadableRecording, or UserError where the limits are exceeded.
     """
-    system = pipeline.engine.system
-    request = ReadRequest(path, system, pipeline.engine.dbc, 1 if speed else batch_windows, speed, start)
+    request = ReadRequest(
+        path, pipeline.engine.system, pipeline.engine.dbc, 1 if speed else batch_windows, speed, start
+    )
     reading = reading_of(request, limits)
     started = time.perf_counter()
-    ride = comfort.RideQuality(system)
-    fed = Fed("", ride=ride)
-    priority = Priority.LIVE if speed else Priority.BATCH
+    fed = Fed("", ride=comfort.RideQuality(pipeline.engine.system))
 
     def name(recorded: str | None) -> str:
         return fed.vehicle or vehicle_of(vehicle, recorded, file_name or path.name)
 
-    def identified() -> Iterator[tuple[Identified | None, Tally]]:
-        for piece in reading.pieces(check):
-            found = None
-            if piece.windows:
-                fed.vehicle = name(piece.vehicle)
-                for window in piece.windows:
-                    if window.outcome != "dropped":
-                        ride.push(window.start, window.values)
-                found = pipeline.identify(fed.vehicle, piece.windows, priority)
-            yield found, piece.tally
-
-    found = prefetched(identified(), 1, check)
+    priority = Priority.LIVE if speed else Priority.BATCH
+    found = prefetched(_identified(pipeline, fed, reading, name, priority, check), 1, check)
     try:
         for one, tally in found:
             on_tally(tally)
@@ -146,6 +135,26 @@ def feed_file(
     _ended(fed, reading.ending)
     fed.wall_seconds = time.perf_counter() - started
     return fed
+
+
+def _identified(
+    pipeline: Pipeline,
+    fed: Fed,
+    reading: Reading,
+    name: Callable[[str | None], str],
+    priority: Priority,
+    check: Callable[[], None],
+) -> Iterator[tuple[Identified | None, Tally]]:
+    """Windows as they are read, identified, with the tally until there; the ride's comfort is kept beside them."""
+    for piece in reading.pieces(check):
+        found = None
+        if piece.windows:
+            fed.vehicle = name(piece.vehicle)
+            for window in piece.windows:
+                if window.outcome != "dropped" and fed.ride is not None:
+                    fed.ride.push(window.start, window.values)
+            found = pipeline.identify(fed.vehicle, piece.windows, priority)
+        yield found, piece.tally
 
 
 def _ended(fed: Fed, ending: Ending) -> None:

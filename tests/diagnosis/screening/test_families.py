@@ -3,9 +3,9 @@
 import pytest
 
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.screening import families
 from sprung.model.diagnosis.screening.families import (
     ELEMENT,
-    FAMILIES,
     FORCE,
     HARMONIC,
     INPUT,
@@ -20,6 +20,8 @@ from sprung.model.laws import find_law
 from sprung.model.system import load_system
 from tests.diagnosis_cases import quarter_car
 from tests.named_laws import element_law
+
+FAMILIES = [value for value in vars(families).values() if isinstance(value, Family)]
 
 
 def candidate(score: float, family: Family, law: str = "cubic_stiffness", count: int = 1) -> Candidate:
