@@ -93,8 +93,8 @@ def pool(some: Sequence[Estimate], prior: FloatArray) -> Pool:
     cross = POOLED * given @ np.mean([p @ of.cross for p, of in zip(precision, said, strict=True)], axis=0)
     # What windows differ in with deviations, while the parameters are the same, tells of the deviations, too.
     apart = [(of.cross - cross).T @ p @ (of.cross - cross) for p, of in zip(precision, said, strict=True)]
-    told = np.mean([of.information for of in said], axis=0) + np.mean(apart, axis=0)
-    information: FloatArray = POOLED * 0.5 * (told + told.T)
+    information_of = np.mean([of.information for of in said], axis=0) + np.mean(apart, axis=0)
+    information: FloatArray = POOLED * 0.5 * (information_of + information_of.T)
     like = replace(said[0], cross=cross, given=given, information=information)
     values, vectors = np.linalg.eigh(information)
     root = np.asarray(vectors * np.sqrt(values.clip(0)), dtype=np.float64)
@@ -234,12 +234,12 @@ class Lives:
         file = None if self.folder is None else self.folder / f"life-{seed}.json"
         settings = [days, seed, measured, fault, self.windows, self.seed, POOLED, ALIKE, FAULTS, asdict(Service())]
         settings = json.loads(json.dumps(settings))  # as they are read back
-        told = kept(file, settings)
-        if told is None:
+        known = kept(file, settings)
+        if known is None:
             lived = live(self.system, self.pools, days, seed, measured=measured, fault=fault)
             keep(file, settings, asdict(lived))
             return lived
-        return Life(**told)
+        return Life(**known)
 
 
 def run(

@@ -11,7 +11,7 @@ off by some per cent, and the run that each strategy chose is simulated with noi
     random     mean of the menu
     best       the best run in hindsight
 
-Figures: mean evidence for the truth, and the share of vehicles that were told apart (evidence beyond 10).
+Figures: mean evidence for the truth, and the share of vehicles that were distinguished (evidence beyond 10).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def run(seed: int = 20261, count: int = 2, vehicles: int = 2, only: str = "") ->
     """count: rounds over the laws with values drawn anew; vehicles: that are simulated for each pair and direction;
     only: a law that is true, or a pair of laws joined by a colon.  A pair does not depend on the others."""
     torch.set_num_threads(1)
-    told: dict[str, list[float]] = {name: [] for name in ("chosen", "t_optimal", "random", "best")}
+    scores: dict[str, list[float]] = {name: [] for name in ("chosen", "t_optimal", "random", "best")}
     laws = {law.name: law for law in parse_system(VEHICLE).catalogue}
     pairs = [(name, other) for name in TRUE for other in laws[name].confused_with]
     for number in range(count):
@@ -95,11 +95,11 @@ def run(seed: int = 20261, count: int = 2, vehicles: int = 2, only: str = "") ->
                 yield {"pair": [name, other], "left_out": str(error)}
                 continue
             for strategy, values in found.items():
-                told[strategy] += values
+                scores[strategy] += values
             yield figure
-    if not told["chosen"]:
+    if not scores["chosen"]:
         return
-    for strategy, evidence in told.items():
+    for strategy, evidence in scores.items():
         shares = np.array(evidence) > STRONG
         yield {"strategy": strategy, "evidence": round(float(np.mean(evidence)), 1)} | {
             "median": round(float(np.median(evidence)), 1),

@@ -109,12 +109,12 @@ def identity(count: int, seconds: float, workers: int) -> Figures:
         with tasks(workers) as (doer, url):
             many = Settings(data_dir=folder / "many", store=url)
             started = time.perf_counter()
-            told = backfill(BackfillPlan(many, str(place), 0, 2**62), doer, workers, _silent)
+            summary = backfill(BackfillPlan(many, str(place), 0, 2**62), doer, workers, _silent)
             together = time.perf_counter() - started
             with opened_store(plain) as one, opened_store(many) as other:
-                found = differences(one, other, engine_of(plain).digest, told.vehicles)
+                found = differences(one, other, engine_of(plain).digest, summary.vehicles)
             name = f"{doer.name}, {'PostgreSQL' if url else 'SQLite'}"
-    yield {"figure": "recordings", "value": count, "seconds_each": seconds, "windows": told.windows, "on": name}
+    yield {"figure": "recordings", "value": count, "seconds_each": seconds, "windows": summary.windows, "on": name}
     yield {"figure": "windows that differ", "value": found["windows"], "target": 0}
     yield {"figure": "alarms that differ", "value": found["alarms"], "of": found["alarms_of"], "target": 0}
     yield {"figure": "largest difference of posteriors", "value": found["posteriors"], "target": TOLERANCE}
@@ -151,14 +151,14 @@ def scaling(count: int, seconds: float, workers: int) -> Figures:
                 head = BackfillPlan(settings, str(place), 0, FIRST + 5 * 10**9)
                 backfill(head, doer, max(number, 1), _silent)  # loads engines
                 started, before = time.perf_counter(), busy_seconds()
-                told = backfill(BackfillPlan(settings, str(place), 0, 2**62), doer, max(number, 1), _silent)
+                summary = backfill(BackfillPlan(settings, str(place), 0, 2**62), doer, max(number, 1), _silent)
                 walls[number] = time.perf_counter() - started
                 busy[number] = busy_seconds() - before
                 yield {
                     "figure": f"windows per second, {doer.name}",
-                    "value": round(told.windows / walls[number], 1),
-                    "windows": told.windows,
-                    "processor_milliseconds_a_window": round(1e3 * busy[number] / told.windows, 2),
+                    "value": round(summary.windows / walls[number], 1),
+                    "windows": summary.windows,
+                    "processor_milliseconds_a_window": round(1e3 * busy[number] / summary.windows, 2),
                     "load": os.getloadavg()[0],
                 }
         for name, one, target in (("1 worker", 1, 0.9), ("a plain loop on each core", 0, 0.85)):

@@ -111,10 +111,10 @@ def chaos(minutes: float, every: float) -> Figures:
                 stack.callback(_end_part, part)
         rounds = max(1, round(60 * minutes * 2 / MOST_WINDOWS))
         messages = _messages(engine, rounds)
-        told = ChaosTold()
+        outcome = ChaosTold()
         links: list[tuple[ClosedLink, Sequence[str]]] = [(NatsLink(address, "chaos"), published)]
         links += [(HttpLink(f"http://127.0.0.1:{port}", None, name), [name]) for name in posting]
-        _ride(links, messages, parts, watched, (60 * minutes, every), told)
+        _ride(links, messages, parts, watched, (60 * minutes, every), outcome)
         expected = sum(len(m.windows) for m in messages)
         settled = _await(lambda: _count(watched, NAMES) >= expected, 120.0)
         time.sleep(settings.late_seconds + 3.0)  # what waits behind a gap is folded at last
@@ -122,7 +122,7 @@ def chaos(minutes: float, every: float) -> Figures:
         alone = _undisturbed(engine, messages, folder)
         found = differences(alone, watched, engine.digest, list(NAMES))
         alone.close()
-    worst = max((seconds for _, seconds in told.recoveries), default=0.0)
+    worst = max((seconds for _, seconds in outcome.recoveries), default=0.0)
     yield {"figure": "minutes", "value": minutes, "kills": {part.name: part.kills for part in parts}}
     yield {"figure": "windows acknowledged to vehicles", "value": expected, "stored": stored, "settled": settled}
     yield {"figure": "windows lost", "value": expected - stored, "target": 0}
@@ -136,7 +136,7 @@ def chaos(minutes: float, every: float) -> Figures:
         "target": RECOVERY_TARGET,
         "load": os.getloadavg()[0],
     }
-    yield {"figure": "recoveries", "value": [[name, round(seconds, 1)] for name, seconds in told.recoveries]}
+    yield {"figure": "recoveries", "value": [[name, round(seconds, 1)] for name, seconds in outcome.recoveries]}
 
 
 def _ride(
@@ -145,16 +145,16 @@ def _ride(
     parts: list[KilledPart],
     store: Store,
     times: tuple[float, float],
-    told: ChaosTold,
+    outcome: ChaosTold,
 ) -> None:
     """Send over all links at once for times[0] seconds, disturbed every times[1]; returns when all is taken."""
     senders = []
     for link, vehicles in links:
         mine = [message for message in messages if message.vehicle in vehicles]
-        sender = threading.Thread(target=_publish, args=(link, mine, times[0], told), daemon=True)
+        sender = threading.Thread(target=_publish, args=(link, mine, times[0], outcome), daemon=True)
         sender.start()
         senders.append(sender)
-    _disturb(parts, store, *times, told)
+    _disturb(parts, store, *times, outcome)
     for sender in senders:
         sender.join()
 
@@ -181,7 +181,7 @@ def _messages(engine: Any, rounds: int) -> list[Message]:
     return messages
 
 
-def _publish(link: ClosedLink, messages: list[Message], seconds: float, told: ChaosTold) -> None:
+def _publish(link: ClosedLink, messages: list[Message], seconds: float, outcome: ChaosTold) -> None:
     """As an edge does: each until it is taken, evenly over the time."""
     begun = time.monotonic()
     for i, message in enumerate(messages):
@@ -189,11 +189,11 @@ def _publish(link: ClosedLink, messages: list[Message], seconds: float, told: Ch
         entry = SpoolEntry(i, "estimates", "", encode(message, "exact"))
         while not link.send(entry).stored:
             time.sleep(0.2)
-        told.published += len(message.windows)
+        outcome.published += len(message.windows)
     link.close()
 
 
-def _disturb(parts: list[KilledPart], store: Store, seconds: float, every: float, told: ChaosTold) -> None:
+def _disturb(parts: list[KilledPart], store: Store, seconds: float, every: float, outcome: ChaosTold) -> None:
     rng, begun = random.Random(7), time.monotonic()
     order: list[KilledPart] = []
     while time.monotonic() - begun + every < seconds:
@@ -211,7 +211,7 @@ def _disturb(parts: list[KilledPart], store: Store, seconds: float, every: float
                 break
             before = now if before < 0 else before
             time.sleep(0.1)
-        told.recoveries.append((part.name, time.monotonic() - restarted))
+        outcome.recoveries.append((part.name, time.monotonic() - restarted))
 
 
 def _undisturbed(engine: Any, messages: list[Message], folder: Path) -> Store:

@@ -116,14 +116,14 @@ def _fleet_figures(
     at_rest = _busy(server)
     most = many.send(port, seconds, 0.0)
     spent = (_busy(server) - at_rest) / most.windows
-    yield {"figure": "windows per second, Ray Serve", "value": round(most.rate, 1)} | most.told() | _cost(spent)
+    yield {"figure": "windows per second, Ray Serve", "value": round(most.rate, 1)} | most.figures() | _cost(spent)
     ratio = {"figure": "ratio", "value": round(most.rate / rate_alone, 2), "target": 4.0}
     # of processor time: one client keeps one core busy at the most, many keep all of them busy
     yield ratio | {"of_all_cores": round((os.cpu_count() or 1) * spent_alone / spent, 2), "load": os.getloadavg()[0]}
     eased = many.send(port, seconds, CLIENTS * many.together / (0.7 * most.rate))
     low, high = np.percentile(eased.seconds, [50, 99])
     yield {"figure": "latency at 70 % load, p99", "value": round(float(high), 3), "unit": "s", "target": 1.0}
-    yield {"figure": "latency at 70 % load, p50", "value": round(float(low), 3), "unit": "s"} | eased.told()
+    yield {"figure": "latency at 70 % load, p50", "value": round(float(low), 3), "unit": "s"} | eased.figures()
 
 
 def _busy(server: postgres.PostgresServer) -> float:
@@ -147,7 +147,7 @@ def _many_vehicles(port: int, body: dict[str, Any], minutes: float) -> Figures:
         "figure": f"{VEHICLES} vehicles at 1/{SLOWER} of the real rate, latency p99",
         "value": round(float(high), 3), "p50": round(float(low), 3), "unit": "s", "target": 1.0, "minutes": minutes,
         "windows_per_second": round(sent.rate, 1), "wanted": rate,
-    } | sent.told()  # fmt: skip
+    } | sent.figures()  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ class Answered:
         """How many were stored."""
         return len(self.seconds) * self.together
 
-    def told(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Beside a figure."""
         return {
             "clients": self.clients,

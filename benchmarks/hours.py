@@ -44,11 +44,11 @@ def full_hours(
     for number in numbers:
         file = None if folder is None else folder / f"hour-{seed}-{number}.json"
         settings = [seed, number, seconds, list(cruise)]
-        told = kept(file, settings)
-        if told is None:
-            told = _hour(number, seed, seconds, cruise)
-            keep(file, settings, told)
-        yield told
+        known = kept(file, settings)
+        if known is None:
+            known = _hour(number, seed, seconds, cruise)
+            keep(file, settings, known)
+        yield known
 
 
 @cache

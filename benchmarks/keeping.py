@@ -15,10 +15,10 @@ def kept(file: Path | None, settings: list[Any]) -> dict[str, Any] | None:
     return found["told"] if found["settings"] == settings else None
 
 
-def keep(file: Path | None, settings: list[Any], told: dict[str, Any]) -> None:
+def keep(file: Path | None, settings: list[Any], result: dict[str, Any]) -> None:
     """`told` of a part, whole or not at all: a run may end while it writes."""
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         beside = file.with_suffix(".part")
-        beside.write_text(json.dumps({"settings": settings, "told": told}), encoding="utf-8")
+        beside.write_text(json.dumps({"settings": settings, "told": result}), encoding="utf-8")
         beside.replace(file)

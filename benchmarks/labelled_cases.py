@@ -3,7 +3,7 @@
 `python -m sprung.benchmarks.labelled_cases DIR [FILE...]`
 
 One line per recording: V verdict, L located, N named, then what was said.  Places and names count as right when the
-set of findings equals the label's; the effects of an unknown verdict are called `unknown`, or told by a `formula`.
+set of findings equals the label's; the effects of an unknown verdict are called `unknown`, or expressed by a `formula`.
 """
 
 from __future__ import annotations

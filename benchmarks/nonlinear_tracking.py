@@ -100,8 +100,8 @@ def _one(
 def _inside(estimate: Estimate, truth: FloatArray) -> np.ndarray:
     """Which identifiable values lie within their 95 % interval."""
     std = np.sqrt(np.diag(estimate.covariance))
-    told = estimate.identifiable
-    return np.abs(estimate.log_ratio - truth)[told] < 1.96 * std[told]
+    identifiable = estimate.identifiable
+    return np.abs(estimate.log_ratio - truth)[identifiable] < 1.96 * std[identifiable]
 
 
 def _time(window: int, system: System) -> int:

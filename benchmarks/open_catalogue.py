@@ -1,4 +1,4 @@
-"""`sprung bench open-catalogue [--count 60] [--seed 1]`: concealed laws that no catalogue has, told as formulas.
+"""`sprung bench open-catalogue [--count 60] [--seed 1]`: concealed laws that no catalogue has, reported as formulas.
 
 A quarter car with a force at its spring that is drawn from a grammar of deflection, rate and one hidden state: a shape
 or the sum of two, its own lengths, rates and times at random.  The truth is integrated here (Runge-Kutta at 1 kHz),
@@ -102,8 +102,8 @@ def _one(random: np.random.Generator, number: int, seconds: float) -> dict[str, 
     record = MadeSamples(clean + noise * random.standard_normal(clean.shape))
     began = time.process_time()
     report = diagnose(parse_system(SYSTEM), record, Options(file=f"open-{number}"))
-    told = next((f for f in report.findings if f.effect == "formula"), None)
-    errors = [] if told is None else errors_of(report, told, law, values, (motion, beyond))
+    formula = next((f for f in report.findings if f.effect == "formula"), None)
+    errors = [] if formula is None else errors_of(report, formula, law, values, (motion, beyond))
     return {
         "number": number,
         "truth": law.text,
@@ -111,7 +111,7 @@ def _one(random: np.random.Generator, number: int, seconds: float) -> dict[str, 
         "verdict": report.verdict,
         "said": [[f.location, f.effect, f.formula] for f in report.findings],
         "errors": [float(f"{e:.3g}") for e in errors],
-        "formula": told is not None,
+        "formula": formula is not None,
         "equivalent": bool(errors) and errors[0] <= GOOD and errors[1] <= GOOD_BEYOND,
         "false": bool(errors) and errors[0] > FALSE,
         "other_name": any(f.effect not in ("formula", "unknown") for f in report.findings),
@@ -214,11 +214,11 @@ def _driven(
 
 
 def errors_of(
-    report: Report, told: Finding, law: OpenLaw, values: dict[str, Array], motions: tuple[Array, Array]
+    report: Report, finding: Finding, law: OpenLaw, values: dict[str, Array], motions: tuple[Array, Array]
 ) -> list[float]:
     """Errors of the whole force on the part that no fit saw, and on another ride at 1.5 times the amplitude."""
     found = {p.name: p.value for p in report.augmented}
-    names: dict[str, Any] = {p.name: p.value for p in told.parameters}
+    names: dict[str, Any] = {p.name: p.value for p in finding.parameters}
     names |= {"sin": np.sin, "cos": np.cos, "tanh": np.tanh, "exp": np.exp, "abs": np.abs, "max": np.maximum}
     names |= {"sqrt": np.sqrt, "sign": np.sign}
     result = []
@@ -228,7 +228,7 @@ def errors_of(
         truth = values["stiffness"][1] * d + values["damping"][1] * v + hidden
         memory = _remembered(d, names["tau"]) if "tau" in names else 0.0
         with np.errstate(all="ignore"):
-            told_force = eval(told.formula, names, {"d": d, "v": v, "z": memory})
+            told_force = eval(finding.formula, names, {"d": d, "v": v, "z": memory})
         model = found["secondary.stiffness"] * d + found["secondary.damping"] * v + told_force
         late = slice(int(share * len(d)), None)
         columns = np.column_stack([d, v, np.ones_like(d)])[late]

@@ -75,8 +75,8 @@ def stated(text: str) -> list[StatedCell]:
     """Every figure of the tables of a page that name their seeds."""
     found = []
     for task, block in BLOCK.findall(text):
-        table, _, told = block.strip().partition("\n\n")
-        made = SEEDS.search(told)
+        table, _, remark = block.strip().partition("\n\n")
+        made = SEEDS.search(remark)
         lines = [[part.strip() for part in line.strip("| ").split("|")] for line in table.splitlines()]
         for line in lines[2:]:
             cells = dict(zip(lines[0][1:], line[1:], strict=False))

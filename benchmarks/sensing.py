@@ -68,15 +68,15 @@ def accuracy(below: Below, count: int, bounds: int, seed: int) -> Iterator[dict[
     spent = time.process_time() - begin
     error = np.array([e.log_ratio for e in estimates]) - truth
     std = np.sqrt([np.diag(e.covariance) for e in estimates])
-    told = np.array([e.identifiable for e in estimates])
-    chosen = np.flatnonzero(told.all(axis=1))[:bounds]
+    identifiable = np.array([e.identifiable for e in estimates])
+    chosen = np.flatnonzero(identifiable.all(axis=1))[:bounds]
     least = np.array([time_domain_bound(system, clean[i], truth[i], fused=True, offsets=True) for i in chosen])
     stated = np.sqrt((std[chosen] ** 2).mean(axis=0) / (least**2).mean(axis=0))
     for group, rows in {**ambient.GROUPS, "all 24": slice(0, 24)}.items():
         if group == "load":
             continue
         # The bound of all windows: that of some in the time domain, carried over by the stated deviations.
-        e, s = error[:, rows][told[:, rows]], std[:, rows][told[:, rows]]
+        e, s = error[:, rows][identifiable[:, rows]], std[:, rows][identifiable[:, rows]]
         bound = np.sqrt((s**2).mean() / (stated[rows] ** 2).mean())
         yield {
             "figure": "accuracy",
@@ -87,7 +87,7 @@ def accuracy(below: Below, count: int, bounds: int, seed: int) -> Iterator[dict[
             "rmse_percent": float(100 * np.sqrt(np.mean(e**2))),
             "bound_percent": float(100 * bound),
             "rmse_over_bound": float(np.sqrt(np.mean(e**2)) / bound),
-            "identifiable": float(told[:, rows].mean()),
+            "identifiable": float(identifiable[:, rows].mean()),
             "error_over_std_rms": float(np.sqrt(np.mean((e / s) ** 2))),
             "coverage_95": float(np.mean(np.abs(e) < 1.96 * s)),
             "target": "<= 1.1, coverage 0.93-0.97",

@@ -133,10 +133,10 @@ def run(
         if number % parts != own - 1 or (names and not any(one in name for one in names)):
             continue
         file = None if folder is None else folder / f"{name.replace(' ', '-')}.json"
-        told = _told(name, make, keys, file, settings)
-        done.append(told)
-        changed = {key: one["changed"] for key, one in told["varied"].items() if one and one["changed"]}
-        yield {key: told[key] for key in ("recording", "verdict", "findings")} | {"changed": changed}
+        known = _told(name, make, keys, file, settings)
+        done.append(known)
+        changed = {key: one["changed"] for key, one in known["varied"].items() if one and one["changed"]}
+        yield {key: known[key] for key in ("recording", "verdict", "findings")} | {"changed": changed}
     lines = [figure(key, one, done) for key, one in keys]
     yield from lines
     if write is not None:
@@ -158,18 +158,18 @@ def _told(
     settings: list[Any],
 ) -> dict[str, Any]:
     """What a recording says of all numbers; None of those that it does not read.  Varied are those not yet known."""
-    told = kept(file, settings) or {}
-    known = told.get("varied", {})
+    result = kept(file, settings) or {}
+    known = result.get("varied", {})
     wanted = {f"{stage}.{one.name}": (stage, one) for stage, one in keys}
     open_keys = [key for key, (_, one) in wanted.items() if known.get(key, {}).get("varied") != _numbers(one)]
-    if not told or open_keys:
+    if not result or open_keys:
         subject = _known(name, *make())  # one at a time: remembered fits take a gigabyte
-        told = {"recording": name, "verdict": subject.said.verdict, "findings": subject.said.findings}
+        result = {"recording": name, "verdict": subject.said.verdict, "findings": subject.said.findings}
         for key in open_keys:
             stage, one = wanted[key]
             known[key] = {"varied": _numbers(one), "found": vary(subject, stage, one)}
-            keep(file, settings, told | {"varied": known})
-    return told | {"varied": {key: known[key]["found"] for key in wanted}}
+            keep(file, settings, result | {"varied": known})
+    return result | {"varied": {key: known[key]["found"] for key in wanted}}
 
 
 def _numbers(number: Field[Any]) -> list[Any]:
@@ -198,7 +198,8 @@ def vary(subject: Subject, stage: str, number: Field[Any]) -> dict[str, Any] | N
 
 def figure(stage: str, number: Field[Any], done: list[dict[str, Any]]) -> dict[str, Any]:
     """The line of a number, over all recordings that its stage reads."""
-    read = {told["recording"]: one for told in done if (one := told["varied"].get(f"{stage}.{number.name}"))}
+    key = f"{stage}.{number.name}"
+    read = {of["recording"]: one for of in done if (one := of["varied"].get(key))}
     found = list(read.values())
     return {
         "stage": stage,

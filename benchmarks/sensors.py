@@ -79,14 +79,14 @@ def run(
                 for number in range(cases):
                     draw = [seed, list(SIZES).index(name), int(1e6 * size), int(begins), number]
                     at = None if folder is None else folder / f"{'-'.join(str(n) for n in draw)}.json"
-                    told = kept(at, [file, SECONDS])
-                    if told is None:
+                    known = kept(at, [file, SECONDS])
+                    if known is None:
                         rng = np.random.default_rng(draw)
                         fault = _drawn(system, name, size, begins, rng)
                         values, truth = ride(system, fault, rng)
-                        told = asdict(judge(system, identifier, tracker, values, truth, fault))
-                        keep(at, [file, SECONDS], told)
-                    found.append(RideVerdict(**told))
+                        known = asdict(judge(system, identifier, tracker, values, truth, fault))
+                        keep(at, [file, SECONDS], known)
+                    found.append(RideVerdict(**known))
                 yield _figures(file, name, size, when, found)
 
 
@@ -196,12 +196,12 @@ def judge(
 
 
 def _is_named(system: System, tracker: Tracker, state: TrackerState, fault: WrongChannel) -> bool:
-    """Whether the channel and the kind are told, as a state or as an alarm; others beside do not count against it."""
+    """Whether the channel and the kind are reported, as a state or as an alarm, whatever else is."""
     names = [channel.name for channel in system.channels]
-    told: set[tuple[str, str]] = {(f.channel, f.kind) for f in tracker.sensors(state)}
+    reported: set[tuple[str, str]] = {(f.channel, f.kind) for f in tracker.sensors(state)}
     for alarm in state.alarms:
         if alarm.kind == "sensor":
             channel, _, kind = (alarm.parameter or "").rpartition(".")
-            told.add((channel, kind))
+            reported.add((channel, kind))
     places = {names[fault.channel], names[fault.other]} if fault.kind == "swapped" else {names[fault.channel]}
-    return any(kind == fault.kind and places == set(channel.split("|")) for channel, kind in told)
+    return any(kind == fault.kind and places == set(channel.split("|")) for channel, kind in reported)

@@ -3,7 +3,7 @@
 Half a lorry on two measured axles, a building on a shaking table that is measured by its acceleration, and a frame
 under a measured force.  Parameters differ from the file by 8 %; motions are simulated at ten times the rate of the
 recording, so that inputs are band-limited between samples.  A place is right when the first finding names exactly the
-channels that were falsified; a clean recording is right when it is consistent; physics may be blamed for none.
+channels that were falsified; a clean recording is right when it is consistent; physics is right for none.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class RigRecord:
 def run(count: int = 60, seed: int = 1, first: int = 0) -> Iterator[dict[str, Any]]:
     """Yields one line per recording from number `first` on, and the rates."""
     cases = [(rig, wrong) for rig in RIGS for wrong in rig.wrong]
-    right = blamed = done = 0
+    right = false_physics = done = 0
     for number in range(first, count):
         rig, wrong = cases[number % len(cases)]
         system, values = recorded(rig, np.random.default_rng([seed, number]))
@@ -80,7 +80,7 @@ def run(count: int = 60, seed: int = 1, first: int = 0) -> Iterator[dict[str, An
         place = wrong.place or "|".join(wrong.channels)
         hit = said[:1] == [(place, wrong.effect)] if wrong.effect else report.verdict == "consistent"
         right, done = right + hit, done + 1
-        blamed += report.verdict == "missing_physics"
+        false_physics += report.verdict == "missing_physics"
         yield {
             "number": number,
             "rig": rig.file,
@@ -90,7 +90,7 @@ def run(count: int = 60, seed: int = 1, first: int = 0) -> Iterator[dict[str, An
             "right": bool(hit),
             "cpu_seconds": round(time.process_time() - began, 1),
         }
-    yield {"recordings": done, "right": right / max(done, 1), "blamed_on_physics": blamed}
+    yield {"recordings": done, "right": right / max(done, 1), "found_as_physics": false_physics}
 
 
 def recorded(rig: Rig, random: np.random.Generator, spread: float = SPREAD) -> tuple[System, Array]:

@@ -3,7 +3,7 @@
 Clean recordings of the independent generator, vehicles drawn anew, are falsified as a workshop does it: a sign, two
 channels exchanged, left and right, a whole node upside down or late, a wrong scale or unit, a sensor or an element
 elsewhere than the system file says, an element at another body.  A place is right when the first finding names exactly
-the channels that were falsified, or the element; a spring or damper may never be blamed otherwise.
+the channels that were falsified, or the element; a spring or damper may never be found changed otherwise.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def run(count: int = 100, seed: int = 1, seconds: float = SECONDS, first: int = 
     """Yields one line per recording from number `first` on, and the rates."""
     system, vehicle = load_system(), read_vehicle(MANCHESTER)
     cases = draw_cases(vehicle, -(-count // EACH), seed, ["clean"])
-    right = named = blamed = done = 0
+    right = named = false_physics = done = 0
     for number, made in enumerate(make_recordings(vehicle, cases, seconds)):
         values = in_order(system, made.values)
         for index, kind in enumerate(KINDS):
@@ -72,7 +72,7 @@ def run(count: int = 100, seed: int = 1, seconds: float = SECONDS, first: int = 
             hit = place == wrong.channels
             other = [f for f in report.findings if f.effect not in {effect.name for effect in SETUP_EFFECTS}]
             physical = any(f.location.split("|")[0] in system.elements for f in other)
-            right, blamed, done = right + hit, blamed + physical, done + 1
+            right, false_physics, done = right + hit, false_physics + physical, done + 1
             named += top is not None and top.effect == KINDS[kind]
             yield {
                 "number": which,
@@ -82,7 +82,7 @@ def run(count: int = 100, seed: int = 1, seconds: float = SECONDS, first: int = 
                 "place": bool(hit),
                 "cpu_seconds": round(time.process_time() - began, 1),
             }
-    yield {"recordings": done, "place": right / done, "named": named / done, "blamed_on_an_element": blamed}
+    yield {"recordings": done, "place": right / done, "named": named / done, "found_at_an_element": false_physics}
 
 
 def in_order(system: System, values: Array) -> Array:

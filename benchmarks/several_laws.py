@@ -3,7 +3,7 @@
 The independent generator conceals laws of the catalogue in the bundled vehicle.  A law counts where its signal-to-noise
 ratio, for a test that knows places and names of all of them and leaves to the others what they imitate, is at least
 twice its limit.  A finding is right where a law of its name is at its place, whatever else is there.  Forces that are
-told without a name, or by a formula, are no names: they are counted apart, and so are those where no law acts at all.
+reported without a name, or by a formula, are no names: they are counted apart, as are those where no law acts at all.
 Where the report says "one or the other" that is no name either; it is right where the law is among them.
 """
 
@@ -31,7 +31,7 @@ NAMED = tuple(name for name, law in LAWS.items() if law.named)
 def run(count: int = 12, seed: int = 1, seconds: float = 60.0) -> Iterator[dict[str, Any]]:
     """Yields one line per recording, then precision and recall."""
     vehicle, system = read_vehicle(MANCHESTER), load_system(MANCHESTER)
-    said = right = visible = found = everything = unnamed = astray = either = among_them = 0
+    said = right = visible = found = everything = unnamed = misplaced = either = among_them = 0
     for number in range(count):
         case = drawn(vehicle, np.random.default_rng([seed, number]))
         values, ratios = make_with_each_missing(vehicle, case, seconds)
@@ -40,24 +40,27 @@ def run(count: int = 12, seed: int = 1, seconds: float = 60.0) -> Iterator[dict[
         truth = {(place, law): ratio / LIMIT for (place, law, _), ratio in zip(case.effects, ratios, strict=True)}
         listed = {f.effect: f.kind is not EffectKind.UNLISTED for f in report.findings}
         families = [(f.location, f.family.split(" or ")) for f in report.findings if f.family is not None]
-        told = [(f.location, f.effect) for f in report.findings if listed[f.effect] and f.family is None]
+        named_laws = [(f.location, f.effect) for f in report.findings if listed[f.effect] and f.family is None]
         among = [(at, law) for at, laws in families for law in laws if (at, law) in truth]
         forces = [f.location for f in report.findings if not listed[f.effect]]
-        unnamed, astray = unnamed + len(forces), astray + sum(at not in {place for place, _ in truth} for at in forces)
+        unnamed, misplaced = (
+            unnamed + len(forces),
+            misplaced + sum(at not in {place for place, _ in truth} for at in forces),
+        )
         due = [one for one, limits in truth.items() if limits >= VISIBLE]
-        said, right = said + len(told), right + sum(one in truth for one in told)
+        said, right = said + len(named_laws), right + sum(one in truth for one in named_laws)
         either, among_them = either + len(families), among_them + len(among)
-        visible, found = visible + len(due), found + sum(one in told + among for one in due)
-        everything += set(told) == set(truth) and not forces and not families
+        visible, found = visible + len(due), found + sum(one in named_laws + among for one in due)
+        everything += set(named_laws) == set(truth) and not forces and not families
         yield {
             "number": number,
             "truth": [[*one, round(limits, 1)] for one, limits in truth.items()],
             "verdict": report.verdict,
-            "said": told,
+            "said": named_laws,
             "either": families,
             "unnamed": forces,
-            "false": [one for one in told if one not in truth],
-            "missed": [one for one in due if one not in told + among],
+            "false": [one for one in named_laws if one not in truth],
+            "missed": [one for one in due if one not in named_laws + among],
             "cpu_seconds": round(time.process_time() - began, 1),
         }
     yield {
@@ -66,7 +69,7 @@ def run(count: int = 12, seed: int = 1, seconds: float = 60.0) -> Iterator[dict[
         "either": either,
         "among_them": among_them,
         "unnamed": unnamed,
-        "unnamed_where_nothing_is": astray,
+        "unnamed_where_nothing_is": misplaced,
         "precision": round(right / said, 3) if said else None,
         "visible": visible,
         "recall": round(found / visible, 3) if visible else None,

@@ -94,11 +94,11 @@ def _kills(place: Path, kills: int, seed: int, seconds: float) -> Iterator[dict[
     goals = {kind: -(-kills * share // total) for kind, _, share in KILLS}
     while any(done[kind] < goal for kind, goal in goals.items()):
         kind = min((k for k in goals if done[k] < goals[k]), key=lambda k: done[k] / goals[k])
-        told = tried[kind].kill(random.Random(f"{seed}-{kind}-{numbers[kind]}"))
+        outcome = tried[kind].kill(random.Random(f"{seed}-{kind}-{numbers[kind]}"))
         numbers[kind] += 1
-        done[kind] += not told.get("too_late", False)
+        done[kind] += not outcome.get("too_late", False)
         with open(log, "a") as file:
-            file.write(json.dumps({"kind": kind, "number": numbers[kind]} | told) + "\n")
+            file.write(json.dumps({"kind": kind, "number": numbers[kind]} | outcome) + "\n")
         if seconds and time.monotonic() - begun > seconds:
             break
     yield {"figure": "kills", "value": sum(done.values()), "asked": kills, "too_late": sum((numbers - done).values())}

@@ -111,12 +111,12 @@ class ReplayKills:
 
     def _close(self, store: Path, printed: Path) -> None:
         self._start(store, printed).wait()
-        told = {line["window"] for line in map(_object, printed.read_text().splitlines()) if "window" in line}
+        reported = {line["window"] for line in map(_object, printed.read_text().splitlines()) if "window" in line}
         alone, mine = content(self._folder / "alone.db"), content(store)
         self._counts.add(
             chains=1,
-            windows_printed=len(told),
-            windows_lost=len(told - _starts(store)),
+            windows_printed=len(reported),
+            windows_lost=len(reported - _starts(store)),
             windows_differ=len(set(alone["windows"]) ^ set(mine["windows"])),
             posterior_differs=alone["tracker"] != mine["tracker"],
             rollups_differ=alone["rollups"] != mine["rollups"],

@@ -75,7 +75,7 @@ def _at(
 ) -> tuple[Counter[str], dict[str, int]]:
     """What is wrong after a cut at each moment; what was acknowledged at the last."""
     disk = ForgetfulDisk(str(data))
-    told: dict[str, set[int]] = {"window": set(), "upload": set(), "diagnosis": set()}
+    reported: dict[str, set[int]] = {"window": set(), "upload": set(), "diagnosis": set()}
     wrong: Counter[str] = Counter()
     waiting = iter([*moments, -1])
     moment = next(waiting)
@@ -84,28 +84,31 @@ def _at(
             shutil.rmtree(after, ignore_errors=True)
             after.mkdir(parents=True)
             disk.write(disk.after_a_cut(rng), after)
-            wrong.update(_wrong(after, told, ride))
+            wrong.update(_wrong(after, reported, ride))
             moment = next(waiting)
         if call.name == "send":
             for kind, which in ACKNOWLEDGED.findall(call.data):
-                told[kind.decode()].add(int(which))
+                reported[kind.decode()].add(int(which))
         else:
             disk.take(call)
     shutil.rmtree(after, ignore_errors=True)
-    return wrong, {kind: len(numbers) for kind, numbers in told.items()}
+    return wrong, {kind: len(numbers) for kind, numbers in reported.items()}
 
 
-def _wrong(after: Path, told: dict[str, set[int]], ride: RestlessRide) -> dict[str, int]:
+def _wrong(after: Path, reported: dict[str, set[int]], ride: RestlessRide) -> dict[str, int]:
     store = after / "sprung.db"
     if not store.exists():
-        return {"windows_lost": len(told["window"]), "uploads_lost": len(told["upload"]) + len(told["diagnosis"])}
+        return {
+            "windows_lost": len(reported["window"]),
+            "uploads_lost": len(reported["upload"]) + len(reported["diagnosis"]),
+        }
     try:
         with closing(sqlite3.connect(store)) as opened:
             if opened.execute("PRAGMA integrity_check").fetchone()[0] != "ok":
                 return {"store_unreadable": 1}
             tables = {row[0] for row in opened.execute("SELECT name FROM sqlite_master")}
             if "jobs" not in tables or "windows" not in tables:
-                lost = len(told["window"]) + len(told["upload"])
+                lost = len(reported["window"]) + len(reported["upload"])
                 return {"windows_lost": lost} if lost else {}
             starts = {row[0] for row in opened.execute("SELECT start_ns FROM windows WHERE vehicle_id = 'windows'")}
             files = dict(
@@ -117,8 +120,8 @@ def _wrong(after: Path, told: dict[str, set[int]], ride: RestlessRide) -> dict[s
     except sqlite3.DatabaseError:
         return {"store_unreadable": 1}
     hop = ride.system.hop / ride.system.sample_rate
-    missing = sum(round((START_SECONDS + number * hop) * 1e9) not in starts for number in told["window"])
-    sent = [(f"{kind}-{number}", number) for kind in ("upload", "diagnosis") for number in told[kind]]
+    missing = sum(round((START_SECONDS + number * hop) * 1e9) not in starts for number in reported["window"])
+    sent = [(f"{kind}-{number}", number) for kind in ("upload", "diagnosis") for number in reported[kind]]
     short = 0
     for vehicle, number in sent:
         if files.get(vehicle):

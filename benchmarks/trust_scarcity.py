@@ -72,28 +72,28 @@ class ScarceService:
         enter = ["nsenter", "--preserve-credentials", "--user", "--mount", "--target", str(self.pid)]
         return [*enter, sys.executable, "-c", program, str(self._folder / "sprung.db")]
 
-    def crowd(self, told: Counter[str]) -> None:
+    def crowd(self, counts: Counter[str]) -> None:
         """Large windows at once, which are identified and not stored."""
         body = b" " * BALLAST + json.dumps(self._ride.window(0, "windows")).encode()
         with ThreadPoolExecutor(CROWD) as clients:
             answers = list(clients.map(lambda _: self._ask("POST", "/identify", body)[0], range(CROWD)))
-        told.update(f"crowd {answer}" for answer in answers)
+        counts.update(f"crowd {answer}" for answer in answers)
 
-    def turn(self, told: Counter[str], reasons: Counter[str]) -> bool:
+    def turn(self, counts: Counter[str], reasons: Counter[str]) -> bool:
         """One window, one look at a page, and the service's health; whether all is well."""
         body = self._ride.window(self._sent, "windows")
         sent, _ = self._ask("POST", "/identify?track=true", json.dumps(body).encode())
-        told[f"window {sent}"] += 1
+        counts[f"window {sent}"] += 1
         if sent == 200:
             self.acknowledged.append(round(float(body["start"]) * 1e9))
             self._sent += 1
         listed, _ = self._ask("GET", "/vehicles")
-        told[f"list {listed}"] += 1
+        counts[f"list {listed}"] += 1
         ready, said = self._ask("GET", "/health/ready")
-        told[f"ready {ready}"] += 1
+        counts[f"ready {ready}"] += 1
         if ready == 503:
             reasons[str(said.get("detail", ""))] += 1
-        told[f"live {self._ask('GET', '/health/live')[0]}"] += 1
+        counts[f"live {self._ask('GET', '/health/live')[0]}"] += 1
         return sent == listed == ready == 200
 
     def _ask(self, method: str, path: str, body: bytes = b"") -> tuple[int | str, dict[str, Any]]:
@@ -187,20 +187,20 @@ def scarcity(folder: Path, seconds: float) -> Iterator[dict[str, Any]]:
     with watched.served as served:
         served.ready()
         for name, taken in SCARCITIES.items():
-            told, reasons = Counter[str](), Counter[str]()
+            counts, reasons = Counter[str](), Counter[str]()
             with taken(watched):
                 until = time.monotonic() + seconds
                 while time.monotonic() < until:
                     if taken is little_memory:
-                        watched.crowd(told)
-                    watched.turn(told, reasons)
+                        watched.crowd(counts)
+                    watched.turn(counts, reasons)
                     time.sleep(TURN)
             back = _back(watched)
             yield {
                 "figure": name,
                 "value": back,
                 "unit": "s until ready",
-                "answers": dict(sorted(told.items())),
+                "answers": dict(sorted(counts.items())),
                 "not_ready": [line for line, _ in reasons.most_common(2)],
             }
         seen = json.loads(subprocess.run(watched.inside(LOOK), capture_output=True, check=True).stdout)

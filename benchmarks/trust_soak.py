@@ -87,8 +87,8 @@ def _ask(port: int, method: str, path: str, body: bytes = b"", kind: str = "appl
         connection.request(method, path, body or None, {"content-type": kind} if body else {})
         answer = connection.getresponse()
         text = answer.read()
-        told = json.loads(text) if "json" in (answer.getheader("content-type") or "") else {}
-        return answer.status, told
+        answered = json.loads(text) if "json" in (answer.getheader("content-type") or "") else {}
+        return answer.status, answered
     except (OSError, http.client.HTTPException):
         return 0, {}
     finally:

@@ -81,9 +81,9 @@ def replay_cuts(folder: Path, ride: RestlessRide, cuts: int, zygote: Zygote, see
 
 def _traced(log: Path, command: list[str], place: Path, out: Path | None = None) -> None:
     """Run a command under strace in a folder.  Raises ValueError where it fails."""
-    with open(out or os.devnull, "ab") as told:
+    with open(out or os.devnull, "ab") as output:
         ended = subprocess.run(
-            [*TRACE, "-o", str(log), *command], cwd=place, stdout=told, stderr=subprocess.PIPE, check=False
+            [*TRACE, "-o", str(log), *command], cwd=place, stdout=output, stderr=subprocess.PIPE, check=False
         )
     if ended.returncode not in (0, 1):  # 1: a recording that is not whole
         raise ValueError(f"the step fails when nobody disturbs it: {ended.stderr.decode(errors='replace')[-300:]}")

@@ -169,7 +169,7 @@ class RideQuality:
         wk = np.sqrt(np.mean([m.wk**2 for m in self.minutes], axis=0))
         peak = np.max([m.peak for m in self.minutes], axis=0)
         rms = np.sqrt(np.mean([m.rms**2 for m in self.minutes], axis=0))
-        told = {
+        by_sensor = {
             name: {
                 "wb_p95": _number(p95[i]),
                 "n_mv_vertical": _number(6 * p95[i]) if len(blocks) >= ENOUGH_BLOCKS else None,
@@ -179,7 +179,7 @@ class RideQuality:
             }
             for i, name in enumerate(self.names)
         }
-        return {"minutes": len(self.minutes), "sensors": told}
+        return {"minutes": len(self.minutes), "sensors": by_sensor}
 
 
 def foreseen(system: System, log_ratio: FloatArray, speed: float = 40.0) -> FloatArray:

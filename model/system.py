@@ -146,7 +146,7 @@ class System:
     def inputs(self) -> tuple[Channel, ...]:
         """Measured input signals, in the order of the file; a support's displacement, velocity, acceleration.
 
-        Wheels on a track have none; the measured speed, where there is one, tells how late each of them is.
+        Wheels on a track have none; the measured speed, where there is one, determines how late each of them is.
         """
         channels = []
         if self.on_track and self._speed_measured and self.file.speed is not None:
@@ -275,15 +275,15 @@ class System:
 
     @cached_property
     def built(self) -> tuple[str, ...]:
-        """Bodies of which windows tell how they are built otherwise than the file says, see `model.simulate.loading`.
+        """Bodies whose constants windows determine beside what the file says, see `model.simulate.loading`.
 
         Those that carry others and roll or pitch, unless their mass is fixed or estimated; none where laws act.
         """
         if self.as_drawn or self.laws or self.on_track or not self.file.inputs:
             return ()
-        told = {load.body for load in self.loads} | {p.element for p in self.parameters if p.quantity == "mass"}
+        described = {load.body for load in self.loads} | {p.element for p in self.parameters if p.quantity == "mass"}
         turning = {n: b for n, b in self.file.bodies.items() if b.roll_inertia or b.pitch_inertia}
-        return tuple(name for name, body in turning.items() if name not in told and not body.mass.fixed)
+        return tuple(name for name, body in turning.items() if name not in described and not body.mass.fixed)
 
     @cached_property
     def doubtful_masses(self) -> dict[str, float]:
@@ -292,12 +292,12 @@ class System:
         Those for which the file states one, and axles: they stand on a support, carry another body and do not pitch;
         new wheels are heavier by several per cent than worn ones.  A mass that is a load, estimated or fixed is none.
         """
-        told = {load.body for load in self.loads} | {p.element for p in self.parameters if p.quantity == "mass"}
+        described = {load.body for load in self.loads} | {p.element for p in self.parameters if p.quantity == "mass"}
         found = {}
         for name, body in self.file.bodies.items():
             mass = body.mass
             std = mass.std / mass.value if mass.std is not None else (AXLE_STD if self._is_axle(name) else 0.0)
-            if std > 0 and not mass.fixed and name not in told:
+            if std > 0 and not mass.fixed and name not in described:
                 found[name] = float(std)
         return found
 
@@ -383,7 +383,7 @@ def parse_system(text: str, source: str = "system file", catalogue: tuple[Law, .
 
 def checked(system: System, source: str) -> System:
     """Refuse a system that the model cannot treat yet, and one whose sensors miss a whole mode: its parameters could
-    not be told from any record."""
+    not be identified from any record."""
     refused = [*placed_laws(system.file, system.catalogue)[1], *unsupported(system.file)]
     refused = refused or misplaced(system.file, system.mechanics, system.laws)
     if refused:

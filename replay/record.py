@@ -132,17 +132,19 @@ def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple
         )
     placed = place(offset, block.channel, block.value, rows, len(channels))
     values = placed.value
-    told = [recording.stamped and _taken_at_stamps(block, offset, channel) for channel in range(len(channels))]
+    as_stamped = [recording.stamped and _taken_at_stamps(block, offset, channel) for channel in range(len(channels))]
     slower = [slower_than(offset[block.channel == channel], 1.0) for channel in range(len(channels))]
-    for channel in np.flatnonzero(placed.off_grid.any(axis=0) | np.array(told) | np.array(slower)):
+    for channel in np.flatnonzero(placed.off_grid.any(axis=0) | np.array(as_stamped) | np.array(slower)):
         own = block.channel == channel
         values[:, channel], between = _resample_long(
-            offset[own], block.value[own], rows, recording.stamped, told[channel]
+            offset[own], block.value[own], rows, recording.stamped, as_stamped[channel]
         )
         if between:
             steps = np.diff(np.sort(block.time[own])) / 1e6
             low, high = np.percentile(steps, [1, 99])
-            reason = "its samples were taken at uneven times" if told[channel] else "its time stamps fit no even clock"
+            reason = (
+                "its samples were taken at uneven times" if as_stamped[channel] else "its time stamps fit no even clock"
+            )
             recording.account.note(
                 f"{channels[channel].name}: {reason} (steps of {low:.3g} to {high:.3g} ms) in "
                 f"{100 * between / rows:.3g} % of the record: interpolated between them (cubic spline)"
@@ -157,11 +159,11 @@ def _taken_at_stamps(block: SampleBlock, offset: FloatArray, channel: int) -> bo
 
 
 def _resample_long(
-    offset: FloatArray, value: FloatArray, rows: int, stamped: bool, told: bool
+    offset: FloatArray, value: FloatArray, rows: int, stamped: bool, as_stamped: bool
 ) -> tuple[FloatArray, int]:
     """Values at the rows, and how many of them had to be interpolated between uneven stamps.
 
-    told: the samples were taken when their stamps say.
+    as_stamped: the samples were taken when their stamps say.
     """
     order = np.argsort(offset, kind="stable")
     offset, value = offset[order], value[order]
@@ -171,7 +173,7 @@ def _resample_long(
         last = min(first + ROWS_AT_ONCE, rows)
         near = slice(*np.searchsorted(offset, [first - 4 * REACH, last + 4 * REACH]))
         at = np.arange(first, last, dtype=np.float64)
-        result = None if told else resample(offset[near], value[near], at)
+        result = None if as_stamped else resample(offset[near], value[near], at)
         if result is None or (not result.even and stamped):
             result = uneven(offset[near], value[near], at)
             between += last - first

@@ -20,7 +20,7 @@ from sprung.service.condition import Condition
 from sprung.service.diagnosis.alarm_signals import AlarmSignals
 from sprung.service.diagnosis.reports import Diagnoses, DiagnosisJobs
 from sprung.service.fleet.ingest import Ingest
-from sprung.service.fleet.telling import FleetTelling
+from sprung.service.fleet.statistics import FleetStatistics
 from sprung.service.housekeeping import Housekeeping
 from sprung.service.jobs.queue import Jobs, Kind
 from sprung.service.jobs.recordings import RecordingJobs
@@ -77,7 +77,7 @@ class Core:
     tokens: Tokens
     stopping: threading.Event
     ingest: Ingest
-    telling: FleetTelling
+    statistics: FleetStatistics
     upload_room: UploadRoom
     waits: Waits
     archive: Archive | None = None
@@ -171,7 +171,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         tokens=Tokens(store, None if settings.admin_token is None else settings.admin_token.get_secret_value()),
         stopping=threading.Event(),
         ingest=Ingest(pipeline, settings.late_seconds),
-        telling=FleetTelling(engine, store, pipeline.model_id),
+        statistics=FleetStatistics(engine, store, pipeline.model_id),
         upload_room=UploadRoom(settings, store),
         waits=waits,
         archive=archive,

@@ -1,4 +1,4 @@
-"""Sprung from Python: a system, its recordings, and what they tell about springs and dampers.
+"""Sprung from Python: a system, its recordings, and what they determine of springs and dampers.
 
 Everything here is also reached as `sprung.NAME`.  Arrays are float64 in SI units; T samples, C channels, I measured
 inputs, S sensors, P parameters.  Input that cannot be used raises a ValueError of one line.
@@ -65,12 +65,12 @@ class ParameterValue:
     std: float  # standard deviation, `unit`
     unit: str
     nominal: float  # `unit`
-    identifiable: bool  # False: the window does not tell; value and std are those of the prior
+    identifiable: bool  # False: the window does not determine it; value and std are those of the prior
 
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedWindow:
-    """What one window told.
+    """What one window identified.
 
     >>> import sprung
     >>> system = sprung.load_system()

@@ -151,7 +151,7 @@ def test_a_system_goes_to_another_process() -> None:
     assert copy.digest == system.digest and copy.catalogue is system.catalogue
 
 
-def test_a_body_that_nothing_holds_is_told_as_such() -> None:
+def test_a_body_that_nothing_holds_is_reported_as_such() -> None:
     """As in a drop test: accelerations do not tell where a free body is."""
     text = """
 name: dropped

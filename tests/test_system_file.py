@@ -216,7 +216,7 @@ estimate: [stiffness, colour]
 """
 
 
-def test_everything_that_is_wrong_is_told_at_once_in_plain_words(
+def test_everything_that_is_wrong_is_reported_at_once_in_plain_words(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     lines = problems(BROKEN)

@@ -95,12 +95,12 @@ def _write_mcap(path: Path, vehicle: Vehicle, values: Array, slow: dict[str, Arr
             for topic, fields in topics.items():
                 if topic == TOPIC and row % SLOW:
                     continue
-                told = (
+                remark = (
                     {f: slow[f][row // SLOW] for f, _ in fields}
                     if topic == TOPIC
                     else {f: sample[c] for f, c in fields}
                 )
-                data = json.dumps({f: float(f"{v:.6g}") for f, v in told.items()}).encode()
+                data = json.dumps({f: float(f"{v:.6g}") for f, v in remark.items()}).encode()
                 writer.add_message(channels[topic], time, data, time)
         writer.finish()
 

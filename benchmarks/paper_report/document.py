@@ -50,7 +50,7 @@ def read_rows(folder: Path) -> Rows:
 def refresh(folder: Path, document: Path, only: list[str] | None = None) -> list[dict[str, Any]]:
     """Write the document's places and its pictures, or `only` places of these kinds or markers."""
     found = read_rows(folder)
-    told: list[dict[str, Any]] = []
+    filled: list[dict[str, Any]] = []
 
     def fill(match: re.Match[str]) -> str:
         kind, task, before = match["kind"], match["task"], match["before"]
@@ -60,19 +60,19 @@ def refresh(folder: Path, document: Path, only: list[str] | None = None) -> list
         if not wanted or kind not in KINDS or (task is not None and not rows):
             return match[0]
         text = KINDS[kind](task or "", rows, folder, before)
-        told.append(
+        filled.append(
             {"place": marker, "rows": len(rows), "seeds": seeds_of(rows), "changed": text != before.strip("\n")}
         )
         return f"<!-- {marker} -->\n{text}\n<!-- end -->"
 
     document.write_text(PLACE.sub(fill, document.read_text()))
     if only is not None:
-        return told
+        return filled
     images = document.parent / "img" / "paper"
     images.mkdir(parents=True, exist_ok=True)
     for picture in (folder / "pictures").glob("*.png"):
         shutil.copy(picture, images)
-    return told
+    return filled
 
 
 def _rows_place(task: str, rows: Rows, folder: Path, before: str) -> str:

@@ -110,7 +110,7 @@ class WindowFit:
         blurs: tuple[float, ...] = (*BLURS, 0.0),
     ) -> Fitted:
         """From `start` (the first of all unknowns and free numbers), or nominal values and what the sensors' power
-        tells about the excitation."""
+        shows about the excitation."""
         responses = Responses(self.system, sensed, self.loads)
         nothing = np.zeros(self.P)
         z = excitation.start(self.power(responses, excitation, found))

@@ -54,7 +54,7 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
     A, B, C, D: states are displacements, then velocities; columns of B are displacement and velocity of one support
     after the other, as `--export` writes them; rows of C are displacements, velocities, accelerations or deflections.
     `mass` (n,) says the scale, or its first entry; left out: the first coordinate weighs 1 kg, which no sensor of
-    motion can tell.
+    motion can identify.
     states, inputs, outputs: names, where they are given, for bodies, supports and sensors.
     rate: Hz, of the recordings; else `sample_rate` of the file.
     Errors: `ExchangeError`, OSError.

@@ -9,7 +9,7 @@ as online; their values are then brought together, by the curvature of each wind
 
 c_w the window's misfit, P_w its information, K what is known before.  What the model of the truth itself leaves over in
 the same arithmetic is taken off; windows of which it leaves more than noise would (the run is too violent there for
-their sampling) tell nothing.
+their sampling) contain no information.
 """
 
 from __future__ import annotations

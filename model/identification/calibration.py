@@ -182,7 +182,7 @@ class DeviationSensitivity:
         return self.model.weight[:, None] * self.model.spectra(signals)
 
     def _relative(self, information: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
-        """Without what no record can tell: one gain, or one delay, that all channels share changes nothing."""
+        """Without what no record can identify: one gain, or one delay, that all channels share changes nothing."""
         C = len(self.model.system.channels)
         for part in (slice(0, C), slice(C, 2 * C)):
             common = torch.zeros(self.measured, 1, dtype=information.dtype)

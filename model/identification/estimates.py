@@ -25,11 +25,11 @@ def estimates(
     with np.errstate(divide="ignore", invalid="ignore"):
         per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
     fits = refined.chi_square < fit_limit(refined.freedom)
-    # A window that fits and yet pins nothing down tells nothing; nor does one whose inputs stand still, whatever moves.
+    # Uninformative: a window that fits and yet determines no parameter, and one whose inputs stand still
     unknown = refined.diverged | refined.ended
-    told = np.where(fits & ~unknown, refined.identifiable[:, :P].any(axis=1) & refined.converged, True)
+    determined = np.where(fits & ~unknown, refined.identifiable[:, :P].any(axis=1) & refined.converged, True)
     moved = refined.excitation > EXCITED
-    informative = moved & told
+    informative = moved & determined
     return [
         Estimate(
             log_ratio=refined.log_ratio[b, :P],

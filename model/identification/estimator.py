@@ -150,7 +150,7 @@ class Estimator:
     def estimate(self, windows: FloatArray, workers: int = 1, *, loads: bool = False) -> EstimatorOutput:
         """Log-ratios and predicted covariances of windows (B, T, C); `workers`: see `model.chunks`.
 
-        loads: what describes the system's loads is told, too, and follows the P parameters in `log_ratio`.
+        loads: what describes the system's loads is estimated, too, and follows the P parameters in `log_ratio`.
         """
 
         def work(at: IntArray) -> tuple[FloatArray, FloatArray]:

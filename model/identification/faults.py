@@ -5,8 +5,8 @@ and an exchange or a reversed sign that ends the contradiction is undone.  A gai
 its own in the residual (`calibration`): the one with the most evidence is taken back from the samples, and the window
 is refined again, until it fits or nothing helps.  What is too large for a linear step, or an exchange that contradicts
 nothing, is tried at the nominal values, where what the sensors should show depends on the inputs alone; a frozen or
-saturated sensor shows itself in its samples, and the window is refined without it.  A window explained this way tells
-as much about the springs as any other.
+saturated sensor shows itself in its samples, and the window is refined without it.  A window explained this way is as
+informative about the springs as any other.
 """
 
 from __future__ import annotations
@@ -122,18 +122,18 @@ class Explainer:
         undone = [Rearrangement.of(f, self.names) for f in turned]
         seen = {int(b): self.stuck.channels(windows[b]) for b in rows}
         rows = rows[[{f.channel for f in seen[b]} == stuck for b in rows.tolist()]]
-        if None in undone or not len(rows):  # one of several, which these windows may tell
+        if None in undone or not len(rows):  # one of several, which these windows may decide
             return {}
-        told = [(*turned, *seen[b]) for b in rows.tolist()]
+        causes = [(*turned, *seen[b]) for b in rows.tolist()]
         columns = np.array([self.names.index(name) for name in stuck], dtype=np.int64)
         if (columns < len(self.system.inputs)).any():
-            return dict(zip(rows.tolist(), self._or_as_they_are(windows[rows], told, {}), strict=True))
+            return dict(zip(rows.tolist(), self._or_as_they_are(windows[rows], causes, {}), strict=True))
         restored = windows[rows]
         for rearrangement in undone:
             restored = restored if rearrangement is None else rearrangement.undone(restored)
         restored[..., columns] = np.nan
         agree = np.flatnonzero(~self.contradictions.contradicted(restored))
-        explained = self._by_steps(restored[agree], [told[i] for i in agree])
+        explained = self._by_steps(restored[agree], [causes[i] for i in agree])
         return {int(rows[agree[i]]): e for i, e in explained.items()}
 
     def contradictory(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:

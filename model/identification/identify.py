@@ -136,8 +136,8 @@ class Identifier:
     def _restored(self, cause: Explained) -> Estimate:
         """The estimate of a window whose measurements were put right."""
         (restored,) = self._estimates(cause.refined, False, cause.point)
-        told, known = restored.adequate and cause.corrected, restored.identified or bool(cause.faults)
-        return replace(self._averaged(restored), faults=cause.faults, adequate=told, identified=known)
+        fitting, known = restored.adequate and cause.corrected, restored.identified or bool(cause.faults)
+        return replace(self._averaged(restored), faults=cause.faults, adequate=fitting, identified=known)
 
     def _allow(self, windows: FloatArray) -> None:
         """Begin to count the work for some windows."""
@@ -169,9 +169,9 @@ class Identifier:
             )
         if self._model_uncertainty.none:
             return estimate
-        told = np.outer(estimate.identifiable, estimate.identifiable)
+        identifiable = np.outer(estimate.identifiable, estimate.identifiable)
         return replace(
-            estimate, covariance=estimate.covariance + np.where(told, self._model_uncertainty.parameters, 0.0)
+            estimate, covariance=estimate.covariance + np.where(identifiable, self._model_uncertainty.parameters, 0.0)
         )
 
     def _asks(self, estimate: Estimate, explainer: Explainer) -> bool:
@@ -274,8 +274,8 @@ def _with_laws(system: System, workers: int, seconds: float) -> Identifies:
 def identifiability(system: System, seed: int = 0) -> FloatArray:
     """Standard deviation of each log-ratio that one simulated window gives at the nominal values, shape (P,).
 
-    The median over 16 windows of running on an average track; `PRIOR_STD` where a window tells nothing.  Without
-    measured inputs what the spectra of an unmeasured track, or of ambient forces, tell.
+    The median over 16 windows of running on an average track; `PRIOR_STD` where a window is uninformative.  Without
+    measured inputs what the spectra of an unmeasured track, or of ambient forces, determine.
     """
     if not system.parameters:
         return np.zeros(0)

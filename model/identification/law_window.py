@@ -269,9 +269,9 @@ class LawWindows:
                 _MEMORY_STD * torch.where(sound[:, None], tangent.memory_size, 1.0)
             ) ** -2.0
         covariance = torch.linalg.inv(information + torch.diag_embed(precision))
-        told = (information, covariance, precision)
+        inverses = (information, covariance, precision)
         return NormalEquations(
-            whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told
+            whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *inverses
         ), tangent
 
     def output_sensitivities(

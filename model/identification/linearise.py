@@ -20,7 +20,7 @@ from sprung.model.simulate.loading import by_inertia, load_terms
 from sprung.model.system import System
 
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
-PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any window that tells something
+PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any informative window
 _RIDGE = 1e-11  # relative, on the normalised free responses
 _UNSEEN = 1e-13  # of the largest free response: below is rounding; those that are seen differ by 1e-4, units included
 
@@ -334,7 +334,7 @@ class WindowModel:
 def prior_std(system: System) -> FloatArray:
     """Standard deviations of the priors of all that can be refined, (P + X,): parameters, then loads.
 
-    Weak ones, but for how a load is spread and where it lies, which a window alone tells worse than common sense.
+    Weak ones, but for how a load is spread and where it lies, which a window alone determines worse than common sense.
     """
     spread = [PRIOR_STD if term.kind == "load" else term.std for term in load_terms(system)]
     return np.array([*(PRIOR_STD for _ in system.parameters), *spread], dtype=np.float64)
@@ -343,7 +343,7 @@ def prior_std(system: System) -> FloatArray:
 def _inverse(stiffness: Tensor) -> Tensor:
     """Inverse of dynamic stiffnesses (..., n, n); the pseudo-inverse at frequency zero of a body that nothing holds.
 
-    Where a free body would go under a steady force is told by its free response, not by its compliance.
+    Where a free body would go under a steady force follows from its free response, not by its compliance.
     """
     found, failed = torch.linalg.inv_ex(stiffness)
     if bool(failed.any()):

@@ -46,7 +46,7 @@ def _motions(model: WindowModel, values: ElementValues, transfer: Transfer, data
     """Coordinates (B, F, n, Y) that noise of every drive and of every sensor moves, and deflections (B, F, E, Y) that
     its supports make beside.
 
-    Sensor noise reaches the fitted motion, at the least, as the motion that it cannot be told from.
+    Sensor noise reaches the fitted motion, at the least, as the motion that it is indistinguishable from.
     """
     of_drives, direct = moved_by_drives(model, values, transfer.compliance)
     kind = of_drives.dtype

@@ -101,7 +101,7 @@ class LawRefiner:
         model = self._with(loads)
 
         def work(at: IntArray) -> Refined:
-            # forces that leave all bounds are told as such
+            # forces that leave all bounds are reported as such
             with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
                 data = self.model.batch(self.model.knots(windows[at]), windows[at], present[at[0]])
                 asked = torch.as_tensor(wanted[at]), bool(wanted.any())

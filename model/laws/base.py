@@ -71,8 +71,8 @@ class Observed:
 def reversal_step(rate: FloatArray) -> float:
     """The rate that one sample passes at a reversal of a motion (T,), m/s, median; 0 where there is none.
 
-    A force that turns within less of it is seen as a jump: its corner has no size that the record tells.  What still
-    trembles where the motion has come to rest does not count.
+    A force that turns within less of it is seen as a jump: the record does not determine the size of its corner.  What
+    still trembles where the motion has come to rest does not count.
     """
     passed = np.abs(np.diff(rate))[rate[1:] * rate[:-1] < 0]
     return float(np.median(passed[passed >= _AT_REST * passed.max()])) if len(passed) else 0.0

@@ -14,9 +14,9 @@ element with `by_load: a` under the body is stiffer by exp(a l).
 
 Bodies below, bogies, are never quite those of their drawing, either.  Four numbers more are a body's own, the same in
 all windows: the logarithms of its roll and pitch inertia, and how much further from its middle its accelerometers are,
-along x and along y, than the file says.  Their masses are the scale of all forces, which no window tells.  A wheel base
-that is a little longer is, in angles that are a little smaller, a smaller pitch inertia and accelerometers that are
-closer together.
+along x and along y, than the file says.  Their masses are the scale of all forces, which no window identifies.  A wheel
+base that is a little longer is, in angles that are a little smaller, a smaller pitch inertia and accelerometers
+that are closer together.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def load_terms(system: System) -> tuple[LoadTerm, ...]:
 
 
 def _own_terms(system: System) -> Iterator[LoadTerm]:
-    """What is told of bodies beside loads, after these: states of trackers from before it was known are continued."""
+    """What is estimated of bodies beside loads, after these: older states of trackers, which lack it, are continued."""
     mechanics = system.mechanics
     shown = mechanics.S[mechanics.sensor_kind == ACCELERATION].any(axis=0)  # coordinates that accelerometers show
     for name in system.built:

@@ -35,7 +35,7 @@ class Cargo:
     scatter: FloatArray  # variance of a pressure beyond GAUGE, estimated from rides, shape (L,)
     past: FloatArray  # the load's logarithm before it was reopened, where it was known then, shape (L,)
     past_variance: FloatArray  # shape (L,)
-    past_at: IntArray  # ns, start of the last window that told of it, shape (L,); 0: never
+    past_at: IntArray  # ns, start of the last window that determined it, shape (L,); 0: never
 
 
 def start(prior_variance: FloatArray) -> Cargo:
@@ -46,7 +46,7 @@ def start(prior_variance: FloatArray) -> Cargo:
 
 
 def remembered(cargo: Cargo, load: FloatArray, variance: FloatArray, known: BoolArray, at: int) -> Cargo:
-    """With the loads (L,) that are `known` before they are reopened; at: ns, the last window that told of them."""
+    """With the loads (L,) that are `known` before they are reopened; at: ns, the last window that determined them."""
     return replace(
         cargo,
         past=np.where(known, load, cargo.past),

@@ -1,4 +1,4 @@
-"""What the tracker is told: the vehicle's time scales and the false alarms that are allowed."""
+"""Settings of the tracker: the vehicle's time scales and the false alarms that are allowed."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class TrackerSettings:
 
     @property
     def holding(self) -> float:
-        """s for which what the last window told holds: no failure of the usual pace makes a change meanwhile."""
+        """s for which the estimate of the last window holds: no failure of the usual pace makes a change meanwhile."""
         return self.change / self.process.drift_rate
 
     def evidence(self, parameters: int) -> float:

@@ -52,7 +52,7 @@ class Alarm:
     std: float | None = None
     peak: float | None = None  # the largest change so far, signed
     closed: int | None = None  # ns; None: active
-    alternatives: tuple[str, ...] = ()  # what the evidence cannot tell it from, "bogie1_1l.gain"
+    alternatives: tuple[str, ...] = ()  # what the evidence cannot distinguish it from, "bogie1_1l.gain"
 
     @property
     def key(self) -> tuple[str, str | None, int]:

@@ -313,7 +313,7 @@ class Tracker:
     def loads(self, state: TrackerState) -> dict[str, tuple[float, float]]:
         """Log-ratio of every loaded mass to the empty one, with its standard deviation, by body.
 
-        Where the present run does not tell yet, as the last one did; see `loads_as_of`.
+        Where the present run does not determine it yet, that of the last one; see `loads_as_of`.
         """
         H, earlier = self.model.size, self._loads_of_earlier(state)
         found = {}
@@ -335,12 +335,12 @@ class Tracker:
             return {}
         covariance = np.linalg.inv(found.information[at][:, at] + np.linalg.inv(self.model.prior[at][:, at]))
         std = np.sqrt(covariance.diagonal() + self._model_uncertainty[1].diagonal()[at])
-        told = {h: (float(found.point[h]), float(s)) for h, s in zip(at.tolist(), std, strict=True)}
-        known = [h for h in self.model.loads_at.tolist() if told[h][1] < KNOWN * self._fusion.limit[h]]
-        return {self.deviations[h].name: told[h] for h in known}
+        values = {h: (float(found.point[h]), float(s)) for h, s in zip(at.tolist(), std, strict=True)}
+        known = [h for h in self.model.loads_at.tolist() if values[h][1] < KNOWN * self._fusion.limit[h]]
+        return {self.deviations[h].name: values[h] for h in known}
 
     def _loads_of_earlier(self, state: TrackerState) -> IntArray:
-        """Of each load, the last window of an earlier run that told of it, ns, where this run does not yet; else 0."""
+        """Of each load, the last window of an earlier run that determined it, ns; 0 where this run does."""
         at = self.model.loads_at
         if state.cargo is None or not len(at):
             return np.zeros(len(at), dtype=np.int64)
@@ -348,7 +348,7 @@ class Tracker:
         return np.where(known, 0, state.cargo.past_at)
 
     def loads_as_of(self, state: TrackerState) -> int | None:
-        """Start of the last window that told of the loads, ns, if they may have changed since; None: `loads` holds."""
+        """Start of the last window that determined the loads, ns, if they may have changed; None: `loads` holds."""
         earlier = self._loads_of_earlier(state)
         if earlier.any():
             return int(earlier[earlier > 0].min())

@@ -10,7 +10,7 @@ from fastapi.responses import Response
 
 from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response
-from sprung.service.fleet.telling import DAYS, knowledge_dict
+from sprung.service.fleet.statistics import DAYS, knowledge_dict
 
 router = APIRouter(tags=["vehicles"])
 
@@ -25,5 +25,5 @@ async def fleet_knowledge(
     """From the roll-ups of the last days, as of the last ten minutes: the usual level of every type of element in every
     class of vehicles, the vehicles that depart most from it, those that get worse fastest, what all vehicles of a class
     did together, and how many will be an alarm's change off their own first level."""
-    found = await run_in_threadpool(core.telling.told, actor.fleet, days)
+    found = await run_in_threadpool(core.statistics.known, actor.fleet, days)
     return json_response(knowledge_dict(found, limit))

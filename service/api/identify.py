@@ -97,7 +97,7 @@ def _answer(engine: Engine, vehicle: str | None, estimate: Estimate) -> dict[str
 def _parameters(
     engine: Engine, log_ratio: FloatArray, std: FloatArray, identifiable: list[bool] | None
 ) -> list[dict[str, Any]]:
-    told = identifiable or [True] * len(log_ratio)
+    reported = identifiable or [True] * len(log_ratio)
     pairs = physical(engine, log_ratio, std)
     ratios = np.exp(log_ratio).tolist()
     return [
@@ -110,7 +110,7 @@ def _parameters(
             "ratio": ratio,
         }
         | ({} if identifiable is None else {"identifiable": ok})
-        for p, (value, spread), ratio, ok in zip(engine.system.tracked, pairs, ratios, told, strict=True)
+        for p, (value, spread), ratio, ok in zip(engine.system.tracked, pairs, ratios, reported, strict=True)
     ]
 
 

@@ -73,14 +73,14 @@ async def vehicle_bundle(
         served = _served(core, connection, id_)
         chosen = _alarm(connection, id_, alarm)
         stretches = [*alarm_signals.kept(connection, id_), *_in_memory(core, id_)]
-        stretch, told = choose(connection, id_, chosen, stretches, newest=alarm is None)
+        stretch, message = choose(connection, id_, chosen, stretches, newest=alarm is None)
         return served, Bundle(
             vehicle=id_,
             series=_estimates(core, connection, id_, served, stretch, chosen),
             alarms=fleet.list_alarms(connection, WantedAlarms(id_), 1000),
             marks=marks.list_marks(connection, id_, 1000),
             stretch=stretch,
-            told=told,
+            reason=message,
         )
 
     if headers_only(request):
@@ -137,17 +137,17 @@ def choose(
     if stretch is not None and stretch.covers(alarm.onset):
         return stretch, _of(stretch, f"the onset of {what} at {to_iso(alarm.onset)}")
     if stretch is not None:
-        told = f"the raising of {what} at {to_iso(alarm.opened)}"
+        message = f"the raising of {what} at {to_iso(alarm.opened)}"
         gone = f"its onset at {to_iso(alarm.onset)} lies before: samples are held for a minute only"
-        return stretch, f"{_of(stretch, told)}; {gone}"
-    told = f"no raw signals of {what} are kept: it was found in a recording, or they were given up for room or age"
+        return stretch, f"{_of(stretch, message)}; {gone}"
+    message = f"no raw signals of {what} are kept: it was found in a recording, or they were given up for room or age"
     source = work.recording_at(connection, vehicle, alarm.onset)
     if source is not None:
         there = "whose file is still here" if source.file is not None else "whose file is gone"
-        told += f"; its onset at {to_iso(alarm.onset)} is in the recording {source.name} ({source.id}), {there}"
+        message += f"; its onset at {to_iso(alarm.onset)} is in the recording {source.name} ({source.id}), {there}"
     if newest and last is not None:
-        return last, f"{told}; {_of(last, 'the newest samples instead')}"
-    return None, told
+        return last, f"{message}; {_of(last, 'the newest samples instead')}"
+    return None, message
 
 
 def _of(stretch: Stretch, what: str) -> str:

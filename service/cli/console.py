@@ -22,8 +22,8 @@ def width_of_output() -> int:
     console = Console()
     if console.is_terminal:
         return console.width
-    told = os.environ.get("COLUMNS", "")
-    return int(told) if told.isdigit() and int(told) > 0 else 120
+    columns = os.environ.get("COLUMNS", "")
+    return int(columns) if columns.isdigit() and int(columns) > 0 else 120
 
 
 def print_table(table: Table) -> None:

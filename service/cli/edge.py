@@ -95,8 +95,8 @@ def run(request: EdgeRequest, json_lines: bool) -> int:
         empty = sending.close(LAST_SECONDS)
     seconds = onboard.counts.windows * engine.system.hop / engine.system.sample_rate
     took = time.perf_counter() - started, time.process_time() - cpu
-    told = _summary(name, onboard.counts, sending, spool_left(sending, empty), seconds, took)
-    print(json.dumps({"edge": told}) if json_lines else _line(told), flush=True)
+    summary = _summary(name, onboard.counts, sending, spool_left(sending, empty), seconds, took)
+    print(json.dumps({"edge": summary}) if json_lines else _line(summary), flush=True)
     return 0 if empty and not sending.refused and not onboard.counts.made_room else 1
 
 
@@ -141,13 +141,13 @@ def spool_left(sending: Sending, empty: bool) -> str:
     return "" if empty else sending.trouble or "the server takes its time"
 
 
-def _line(told: dict[str, Any]) -> str:
-    left = f"; some wait in the spool: {told['waiting']}" if told["waiting"] else ""
-    made = told["messages"] + told["recordings"]
+def _line(summary: dict[str, Any]) -> str:
+    left = f"; some wait in the spool: {summary['waiting']}" if summary["waiting"] else ""
+    made = summary["messages"] + summary["recordings"]
     return (
-        f"{told['vehicle']}: {told['windows']} windows, {told['sent']} of {made} messages sent, "
-        f"{told['estimate_bytes_per_second'] or 0:.0f} B/s of estimates, "
-        f"{told['raw_bytes'] / 1e3:.0f} kB of raw samples, {100 * (told['cpu_share'] or 0):.1f} % of a core{left}"
+        f"{summary['vehicle']}: {summary['windows']} windows, {summary['sent']} of {made} messages sent, "
+        f"{summary['estimate_bytes_per_second'] or 0:.0f} B/s of estimates, "
+        f"{summary['raw_bytes'] / 1e3:.0f} kB of raw samples, {100 * (summary['cpu_share'] or 0):.1f} % of a core{left}"
     )
 
 

@@ -81,8 +81,8 @@ def _from_report(path: Path, system_file: Path, menu: Menu) -> dict[str, System]
         for name in _nearest(finding):
             try:
                 systems[f"{element}: {name}"] = rival(system, element, effect, name, inputs)
-            except NoRival as told:
-                print(told, file=sys.stderr)
+            except NoRival as refusal:
+                print(refusal, file=sys.stderr)
     if len(systems) < 2:
         raise UserError(
             f"{path}: names no look-alike of a law that {system_file} holds; there is nothing to distinguish"

@@ -61,9 +61,9 @@ def run_backfill(
 
     def show(file: FoldedFile, done: int, of: int) -> None:
         if json_lines:
-            told = {"file": file.file.path, "vehicle": file.file.vehicle, "windows": file.windows}
-            told |= {"known": file.known, "problem": file.problem, "before": file.before}
-            print(json.dumps(told), flush=True)
+            summary = {"file": file.file.path, "vehicle": file.file.vehicle, "windows": file.windows}
+            summary |= {"known": file.known, "problem": file.problem, "before": file.before}
+            print(json.dumps(summary), flush=True)
         else:
             known = f", {file.known} known from another recording" if file.known else ""
             said = "done before" if file.before else file.problem or f"{file.windows} windows{known}"
@@ -71,20 +71,22 @@ def run_backfill(
 
     tasks = tasks_for(_on(on), workers)
     try:
-        told = backfill(plan, tasks, workers or os.cpu_count() or 1, show)
+        summary = backfill(plan, tasks, workers or os.cpu_count() or 1, show)
     finally:
         tasks.close()
     seconds = time.perf_counter() - started
     if json_lines:
-        print(json.dumps({"summary": asdict(told) | {"wall_seconds": round(seconds, 1), "on": tasks.name}}), flush=True)
+        print(
+            json.dumps({"summary": asdict(summary) | {"wall_seconds": round(seconds, 1), "on": tasks.name}}), flush=True
+        )
     else:
-        for problem in told.problems:
+        for problem in summary.problems:
             print(f"sprung: {problem}", file=sys.stderr)
         print(
-            f"{told.files} files, {told.done_before} of them done before; {told.windows} windows of "
-            f"{len(told.vehicles)} vehicles in {seconds:.0f} s on {tasks.name}; {len(told.problems)} problems"
+            f"{summary.files} files, {summary.done_before} of them done before; {summary.windows} windows of "
+            f"{len(summary.vehicles)} vehicles in {seconds:.0f} s on {tasks.name}; {len(summary.problems)} problems"
         )
-    return 1 if told.problems else 0
+    return 1 if summary.problems else 0
 
 
 def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, workers: int | None, json_lines: bool) -> int:
@@ -110,8 +112,8 @@ def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, worker
         tasks.close()
     seconds = time.perf_counter() - started
     if json_lines:
-        told = {"verdicts": verdicts, "done_before": before, "problems": problems, "wall_seconds": round(seconds, 1)}
-        print(json.dumps({"summary": told | {"on": tasks.name}}), flush=True)
+        summary = {"verdicts": verdicts, "done_before": before, "problems": problems, "wall_seconds": round(seconds, 1)}
+        print(json.dumps({"summary": summary | {"on": tasks.name}}), flush=True)
     else:
         for problem in problems:
             print(f"sprung: {problem}", file=sys.stderr)

@@ -32,15 +32,15 @@ def parameter_table(view: VehicleView, width: int = 120) -> Table:
     for name in shown:
         table.add_column(name, justify="left" if name in ("parameter", "state") else "right", no_wrap=True)
     for p in view.parameters:
-        told = p.identifiable
+        known = p.identifiable
         cells = {
             "parameter": p.name,
-            "value": quantity(p.value, p.unit) if told else "–",
-            "± std": quantity(p.std, p.unit) if told else "–",
+            "value": quantity(p.value, p.unit) if known else "–",
+            "± std": quantity(p.std, p.unit) if known else "–",
             "nominal": quantity(p.nominal, p.unit),
-            "ratio": f"{p.value / p.nominal:.3f}" if told else "–",
+            "ratio": f"{p.value / p.nominal:.3f}" if known else "–",
             "drift": percent(p.drift),
-            "state": _state(p.alarm, told, p.drift),
+            "state": _state(p.alarm, known, p.drift),
         }
         colour = {"alarm": "red", "warning": "yellow"}.get(p.alarm or "")
         table.add_row(*(cells[name] for name in shown), style=colour)

@@ -25,9 +25,9 @@ from sprung.service.monitoring.processed import Batch
 from sprung.service.monitoring.views import (
     VehicleView,
     alarm_dict,
+    changed_part,
     load_parameters,
     size_in_words,
-    told,
     vehicle_view,
     window_dict,
 )
@@ -87,9 +87,9 @@ def run(
                 settings.store is not None,
             )
             status = max(status, _report(pipeline, called, fed, json_lines))
-            told = slower_line(fed, speed)
-            if told:
-                print(f"sprung: {called}: {told}", file=sys.stderr)
+            remark = slower_line(fed, speed)
+            if remark:
+                print(f"sprung: {called}: {remark}", file=sys.stderr)
     return status
 
 
@@ -219,7 +219,7 @@ def closing_line(view: VehicleView, fed: Fed) -> str:
     if fed.stored_before:
         lines.append(f"{fed.stored_before} windows were in the store already")
     for alarm in view.active:
-        what = told(alarm) or "windows no longer fit the model"
+        what = changed_part(alarm) or "windows no longer fit the model"
         change = f" {size_in_words(alarm.parameter, alarm.change, alarm.std)}".rstrip()
         apart = "; the measurements do not distinguish them" if alarm.alternatives else ""
         lines.append(f"{alarm.severity}: {what}{change} since {to_iso(alarm.onset)}{apart}")

@@ -54,9 +54,9 @@ def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = No
         if left:
             print(f"sprung: {out}: it does not hold {', '.join(left)}", file=sys.stderr)
         return 0
-    told = identifiability(system) if system.bodies else np.full(len(system.parameters), np.nan)
+    deviations = identifiability(system) if system.bodies else np.full(len(system.parameters), np.nan)
     if json_lines:
-        print(json.dumps(_as_dict(system, told), indent=None))
+        print(json.dumps(_as_dict(system, deviations), indent=None))
         return 0
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
@@ -76,7 +76,7 @@ def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = No
     console.print(_elements(system))
     console.print(_modes(system))
     if system.parameters:
-        console.print(_parameters(system, told))
+        console.print(_parameters(system, deviations))
     return 0
 
 
@@ -110,7 +110,7 @@ def _modes(system: System) -> Table:
     return table
 
 
-def _parameters(system: System, told: Any) -> Table:
+def _parameters(system: System, deviations: Any) -> Table:
     under = "on an average track"
     if not system.file.inputs:
         under = "without any measured input, of vibration well above the noise,"
@@ -118,7 +118,7 @@ def _parameters(system: System, told: Any) -> Table:
         under = "on an average unmeasured track"
     title = f"What one window of {system.window / system.sample_rate:g} s {under} determines"
     table = Table("parameter", "nominal", "standard deviation", "", title=title, title_justify="left")
-    for parameter, std in zip(system.parameters, np.asarray(told), strict=True):
+    for parameter, std in zip(system.parameters, np.asarray(deviations), strict=True):
         known = std < KNOWN_SHARE * PRIOR_STD
         table.add_row(
             parameter.name,
@@ -129,7 +129,7 @@ def _parameters(system: System, told: Any) -> Table:
     return table
 
 
-def _as_dict(system: System, told: Any) -> dict[str, Any]:
+def _as_dict(system: System, deviations: Any) -> dict[str, Any]:
     return {
         "name": system.name,
         "digest": system.digest,
@@ -151,6 +151,6 @@ def _as_dict(system: System, told: Any) -> dict[str, Any]:
                 "window_std": float(std) if system.bodies else None,
                 "identifiable": bool(std < KNOWN_SHARE * PRIOR_STD) if system.bodies else None,
             }
-            for p, std in zip(system.parameters, np.asarray(told), strict=True)
+            for p, std in zip(system.parameters, np.asarray(deviations), strict=True)
         ],
     }

@@ -14,7 +14,7 @@ from sprung.service.export.tables import estimate, values_of
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.ring import Excerpt
 from sprung.service.monitoring.simulated import Compared
-from sprung.service.monitoring.views import size_in_words, told
+from sprung.service.monitoring.views import changed_part, size_in_words
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.history import Series
 from sprung.service.store.marks import MarkRow
@@ -33,7 +33,7 @@ class Bundle:
     alarms: Sequence[AlarmRow]
     marks: Sequence[MarkRow]
     stretch: Stretch | None  # whose samples the file holds
-    told: str  # which they are, and why
+    reason: str  # which they are, and why
 
 
 def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequence[Compared]) -> bytes:
@@ -60,7 +60,7 @@ def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequ
 
 def _told(file: McapSink, found: Bundle, excerpt: Excerpt | None, windows: Sequence[Compared]) -> None:
     """An event that describes the contents of the file and what is missing."""
-    text, level = found.told, INFO
+    text, level = found.reason, INFO
     if excerpt is None:
         level = WARNING
         if found.stretch is not None:
@@ -94,7 +94,7 @@ def _compared(file: McapSink, engine: Engine, window: Compared) -> None:
 
 def _alarm(file: McapSink, alarm: AlarmRow) -> None:
     level = ERROR if alarm.severity == "alarm" else WARNING
-    what = told(alarm) or "windows no longer fit the model"
+    what = changed_part(alarm) or "windows no longer fit the model"
     change = f" {size_in_words(alarm.parameter, alarm.change)}".rstrip()
     file.event(alarm.onset, level, alarm.kind, f"{alarm.severity}: {what}{change}: begins here")
     file.event(alarm.opened, level, alarm.kind, f"{alarm.severity}: {what}{change}: raised")

@@ -116,8 +116,8 @@ def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> B
     """Do it all; what cannot be read is collected, everything else goes on."""
     found = list_recordings(plan.place)
     looked = [tasks.result(one) for one in [tasks.submit(look, plan, file) for file in found]]
-    told = Backfilled(files=len(found))
-    told.problems += [_of_file(file, file.problem) for file in looked if file.problem]
+    summary = Backfilled(files=len(found))
+    summary.problems += [_of_file(file, file.problem) for file in looked if file.problem]
     files = sorted((f for f in looked if not f.problem), key=lambda f: (f.first_ns, f.vehicle, f.path))
     with opened_store(plan.settings) as store, store.read() as connection:
         rows = {file.id: work.get_recording(connection, _row_id(plan, file)) for file in files}
@@ -136,15 +136,15 @@ def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> B
                 lost.add(file.vehicle)
                 folded = FoldedFile(file, problem=str(error))
             done += 1
-            told.windows += folded.windows
+            summary.windows += folded.windows
             if folded.problem:
-                told.problems.append(_of_file(folded.file, folded.problem))
+                summary.problems.append(_of_file(folded.file, folded.problem))
             on_file(folded, done, len(files))
 
     for file in files:
         row = rows[file.id]
         if row is not None and row.finished_ns is not None:
-            told.done_before += 1
+            summary.done_before += 1
             done += 1
             on_file(FoldedFile(file, before=True), done, len(files))
             continue
@@ -153,10 +153,10 @@ def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> B
         waiting.append((file, last[file.vehicle]))
         settle(0 if tasks.at_once else AHEAD * cores)
     settle(0)
-    told.vehicles = sorted({file.vehicle for file in files})
-    for one in [tasks.submit(swap_vehicle, plan, vehicle) for vehicle in told.vehicles if vehicle not in lost]:
-        told.swapped += tasks.result(one)
-    return told
+    summary.vehicles = sorted({file.vehicle for file in files})
+    for one in [tasks.submit(swap_vehicle, plan, vehicle) for vehicle in summary.vehicles if vehicle not in lost]:
+        summary.swapped += tasks.result(one)
+    return summary
 
 
 def list_recordings(place: str) -> list[FoundFile]:

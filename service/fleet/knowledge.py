@@ -186,24 +186,24 @@ def newest_of(values: FloatArray) -> FloatArray:
 
 def usual_levels(kind: str, level: FloatArray, std: FloatArray, classes: np.ndarray) -> list[UsualLevel]:
     """Class means, shrunken towards the mean of all classes; level and std of shape (V, elements of the type)."""
-    told = []
+    known = []
     for name in dict.fromkeys(classes.tolist()):
         own = classes == name
         ok = np.isfinite(level[own])
-        told.append((name, level[own][ok], std[own][ok], int(ok.any(axis=1).sum())))
-    told = [one for one in told if len(one[1])]
-    within = [_moments(y, s) for _, y, s, _ in told]
-    degrees = np.array([len(y) - 1 for _, y, _, _ in told])
+        known.append((name, level[own][ok], std[own][ok], int(ok.any(axis=1).sum())))
+    known = [one for one in known if len(one[1])]
+    within = [_moments(y, s) for _, y, s, _ in known]
+    degrees = np.array([len(y) - 1 for _, y, _, _ in known])
     own_variance = float(np.sum(degrees * [one[2] for one in within]) / max(degrees.sum(), 1))
-    means = np.array([np.average(y, weights=1 / (s**2 + own_variance)) for _, y, s, _ in told])
-    errors = np.array([np.sqrt(1 / np.sum(1 / (s**2 + own_variance))) for _, _, s, _ in told])
+    means = np.array([np.average(y, weights=1 / (s**2 + own_variance)) for _, y, s, _ in known])
+    errors = np.array([np.sqrt(1 / np.sum(1 / (s**2 + own_variance))) for _, _, s, _ in known])
     overall, _, between = _moments(means, errors)
     share = between / (between + errors**2) if between > 0 else np.zeros(len(means))
     shrunk = overall + share * (means - overall) if len(means) > 1 else means
     sure = np.sqrt(share) * errors if len(means) > 1 and between > 0 else errors
     return [
         UsualLevel(kind, name, count, float(m), float(e), float(np.sqrt(own_variance)), float(np.sqrt(between)))
-        for (name, _, _, count), m, e in zip(told, shrunk, sure, strict=True)
+        for (name, _, _, count), m, e in zip(known, shrunk, sure, strict=True)
     ]
 
 
@@ -223,7 +223,7 @@ def without_common_mode(
     found: FleetLevels, level: FloatArray, classes: np.ndarray, kinds: np.ndarray
 ) -> tuple[FloatArray, list[CommonMode]]:
     """Levels (V, N, P) less what the vehicles of a class did together, and what that was, sure or not."""
-    rest, told = level.copy(), []
+    rest, common = level.copy(), []
     with np.errstate(invalid="ignore"):
         own = np.nanmedian(np.where(np.isfinite(level), level, np.nan), axis=1, keepdims=True) if level.size else level
     parts = part_of(found.time)
@@ -245,8 +245,8 @@ def without_common_mode(
                     at[at.any(axis=1)][:, :, None], middle, 0.0
                 )
                 warm = _mean(found.temperature[at]) if found.temperature is not None else np.nan
-                told.append(CommonMode(str(name), str(kind), int(found.time[at].min()), middle, spread, warm))
-    return rest, told
+                common.append(CommonMode(str(name), str(kind), int(found.time[at].min()), middle, spread, warm))
+    return rest, common
 
 
 def _mean(values: FloatArray) -> float:
@@ -259,7 +259,7 @@ def temperature_effects(modes: Sequence[CommonMode]) -> tuple[TemperatureEffect,
 
     Least squares over days, weighted by what is known of each; the scatter about the line counts where it is larger.
     """
-    told = []
+    effects = []
     for name, kind in dict.fromkeys((one.vehicle_class, one.kind) for one in modes):
         own = [m for m in modes if (m.vehicle_class, m.kind) == (name, kind) and np.isfinite(m.temperature)]
         t, y = np.array([m.temperature for m in own]), np.array([m.change for m in own])
@@ -272,8 +272,8 @@ def temperature_effects(modes: Sequence[CommonMode]) -> tuple[TemperatureEffect,
         std = float(np.sqrt(excess / np.sum(w * dt**2)))
         if abs(slope) > 3 * std:
             left = float(np.sum(w * (dy - slope * dt) ** 2) / np.sum(w * dy**2))
-            told.append(TemperatureEffect(name, kind, slope, std, 1 - left, len(own)))
-    return tuple(told)
+            effects.append(TemperatureEffect(name, kind, slope, std, 1 - left, len(own)))
+    return tuple(effects)
 
 
 def part_of(time: np.ndarray) -> np.ndarray:

@@ -83,8 +83,8 @@ def diagnose_file(order: DiagnosisOrder) -> DiagnosedFile:
             found = run(DiagnosisRequest(path, Path(file.path).name, system, dbc, out), lambda stage: None)
     except Exception as error:  # the others go on
         return _failed(file, told_of(error))
-    told: list[dict[str, Any]] = found.report.get("findings", [])
-    sentences = tuple(str(one.get("sentence") or f"{one['effect']} at {one['location']}") for one in told)
+    findings: list[dict[str, Any]] = found.report.get("findings", [])
+    sentences = tuple(str(one.get("sentence") or f"{one['effect']} at {one['location']}") for one in findings)
     diagnosed = DiagnosedFile(file.path, found.verdict, sentences, "")
     part = out / f"{DONE}.part"
     part.write_text(json.dumps({"key": order.key} | asdict(diagnosed)), encoding="utf-8")
@@ -96,10 +96,10 @@ def diagnose_file(order: DiagnosisOrder) -> DiagnosedFile:
 def _done(order: DiagnosisOrder) -> DiagnosedFile | None:
     """What an earlier run has made of the same recording; None where there is none."""
     try:
-        told = json.loads((order.out / DONE).read_text(encoding="utf-8"))
-        if told["key"] != order.key:
+        kept = json.loads((order.out / DONE).read_text(encoding="utf-8"))
+        if kept["key"] != order.key:
             return None
-        return DiagnosedFile(order.file.path, str(told["verdict"]), tuple(told["findings"]), "", before=True)
+        return DiagnosedFile(order.file.path, str(kept["verdict"]), tuple(kept["findings"]), "", before=True)
     except (OSError, ValueError, KeyError, TypeError):
         return None
 

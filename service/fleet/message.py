@@ -254,12 +254,12 @@ def _deviating(found: Sequence[tuple[int, Deviating]], coding: Coding) -> dict[s
         return packed | {name: pack_floats(values) for name, values in names.items()}
     wide, sure = _scales(given, information)
     with np.errstate(divide="ignore", invalid="ignore"):
-        told = np.round(cross / (SHIFT_STEP * wide[:, :, None] * sure[:, None, :]))
+        rounded = np.round(cross / (SHIFT_STEP * wide[:, :, None] * sure[:, None, :]))
         pull = np.round(score / (SHIFT_STEP * sure))
     return packed | {
         "given": pack_spd(given),
         "information": pack_spd(information),
-        "cross": pack_ints(np.nan_to_num(told, posinf=0, neginf=0).astype(np.int64)),
+        "cross": pack_ints(np.nan_to_num(rounded, posinf=0, neginf=0).astype(np.int64)),
         "score": pack_ints(np.nan_to_num(pull, posinf=0, neginf=0).astype(np.int64)),
     }
 

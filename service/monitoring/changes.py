@@ -37,8 +37,8 @@ class TrackerChange:
     @cached_property
     def view(self) -> VehicleView:
         """How the vehicle is seen after its windows."""
-        told = (r for r in reversed(self.records) if r.solved is not None and r.outcome != UNINFORMATIVE)
-        return vehicle_view(self.after.served.engine, self.vehicle, self.after.state, next(told, None))
+        informative = (r for r in reversed(self.records) if r.solved is not None and r.outcome != UNINFORMATIVE)
+        return vehicle_view(self.after.served.engine, self.vehicle, self.after.state, next(informative, None))
 
     def made_ready(self, shown: bool) -> TrackerChange:
         """Itself, with what `keep_changes` takes made before the store waits for it; shown: with the view."""

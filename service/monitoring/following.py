@@ -105,7 +105,12 @@ def _pass(
         ran.append(Ran(window.start, running(system, window, loads) | stood))
         solved = None if estimate is None else Solved.of(estimate)
         record = WindowRecord(window.start, outcome, reason, window.repaired_samples, fed, solved, posterior)
-        kept = WindowLoads(*({body: told[body] for body in named if body in told} for told in (alone, loads)))
+        kept = WindowLoads(
+            *(
+                {body: loads_of_body[body] for body in named if body in loads_of_body}
+                for loads_of_body in (alone, loads)
+            )
+        )
         records.append(replace(record, loads=kept))
     return FollowedWindows(followed, records, ran)
 

@@ -111,8 +111,8 @@ class RideCollector(Collector):
             labels=["vehicle"],
         )
         for vehicle, minute in self._rides.all().items():
-            for sensor, told in minute.sensors.items():
-                for quantity, value in told.items():
+            for sensor, by_quantity in minute.sensors.items():
+                for quantity, value in by_quantity.items():
                     if value is not None:
                         values.add_metric([vehicle, sensor, quantity], value)
             if minute.cost is not None:

@@ -103,8 +103,8 @@ class VehicleView:
     def status(self, elements: Sequence[str]) -> Status:
         """The vehicle's line in the list of the fleet; `elements` in the order of the drawing."""
         counts, largest = self.active_by_severity(), self.largest
-        told = self.last is not None and self.last.outcome != UNINFORMATIVE  # else the fit before it stands
-        solved = self.last.solved if told and self.last is not None else None
+        informative = self.last is not None and self.last.outcome != UNINFORMATIVE  # else the fit before it stands
+        solved = self.last.solved if informative and self.last is not None else None
         letters = {name: "." for name in elements}
         for p in self.parameters:
             letters[p.element] = max(letters.get(p.element, "."), _letter(p), key=LETTERS.index)
@@ -212,7 +212,7 @@ def spoken(parameter: str) -> str:
     return f"{quantity} of all {f'{group} ' if group else ''}elements"
 
 
-def told(alarm: Alarm | AlarmRow) -> str:
+def changed_part(alarm: Alarm | AlarmRow) -> str:
     """What an alarm is about; what the measurements do not tell it from comes first, for a sensor is checked sooner."""
     return " or ".join([*alarm.alternatives, spoken(alarm.parameter or "")])
 
@@ -343,10 +343,10 @@ def window_dict(engine: Engine, record: WindowRecord) -> dict[str, Any]:
     }
     solved, posterior = record.solved, record.posterior
     if solved is not None:
-        told: Sequence[bool] = solved.identifiable.tolist()
+        identifiable: Sequence[bool] = solved.identifiable.tolist()
         pairs = physical(engine, solved.log_ratio, solved.std)
         line["fit"] = {"nrmse": finite(solved.nrmse), "adequate": solved.adequate}
-        line["estimate"] = {n: list(p) for n, p, ok in zip(names, pairs, told, strict=True) if ok}
+        line["estimate"] = {n: list(p) for n, p, ok in zip(names, pairs, identifiable, strict=True) if ok}
     if posterior is not None:
         pairs = physical(engine, posterior.log_ratio, posterior.std)
         line["posterior"] = {n: list(p) for n, p in zip(names, pairs, strict=True)}

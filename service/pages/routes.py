@@ -15,7 +15,7 @@ from sqlalchemy import Connection
 from sprung.service.api.access import ActorOf, CoreOf, read
 from sprung.service.api.fleet import silent_before
 from sprung.service.api.queries import one_of
-from sprung.service.fleet.telling import knowledge_dict
+from sprung.service.fleet.statistics import knowledge_dict
 from sprung.service.rendering.drawing import columns, small_view
 from sprung.service.rendering.render import render
 from sprung.service.store import status
@@ -68,7 +68,7 @@ async def fleet_page(
         return rows, status.health_counts(connection, wanted)
 
     rows, counts = await read(core, query)
-    told = await run_in_threadpool(core.telling.told, actor.fleet) if page == 1 else None
+    knowledge = await run_in_threadpool(core.statistics.known, actor.fleet) if page == 1 else None
     total = sum(counts.values()) if wanted.health is None else counts[wanted.health]
     asked = {"q": q, "sort": sort, "health": health, "page": page}
     asked |= {name: "true" for name, on in (("silent", silent), ("open", open), ("retired", retired)) if on}
@@ -76,7 +76,7 @@ async def fleet_page(
         render(
             "fleet.html",
             rows=rows,
-            told=None if told is None else knowledge_dict(told, SHOWN_STANDINGS),
+            knowledge=None if knowledge is None else knowledge_dict(knowledge, SHOWN_STANDINGS),
             counts=counts,
             wanted=wanted,
             searching=wanted != Wanted(fleet=actor.fleet),

@@ -153,9 +153,9 @@ def small_view(system: System, found: DrawingColumns, letters: str) -> str:
     sides = sorted({y for _, y in found.at}, reverse=True)
     names = {".": "learning", "?": "not_identifiable", "o": "ok", "w": "warning", "a": "alarm"}
     bad = [name for name, letter in zip(system.elements, letters, strict=False) if letter in "wa"]
-    told = f"changed: {', '.join(bad)}" if bad else "no element has changed"
+    caption = f"changed: {', '.join(bad)}" if bad else "no element has changed"
     width, height = 120.0, 8.0 + 12.0 * len(sides)
-    parts = [f'<svg class="small" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(told)}">']
+    parts = [f'<svg class="small" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(caption)}">']
     for name, letter in zip(system.elements, letters, strict=False):
         x, y = found.layout.element_position(name)
         across = 6 + (found.across(x, y) / found.width) * (width - 12)
@@ -195,7 +195,7 @@ def _body(found: DrawingColumns, name: str, top: float) -> str:
 def _element(name: str, short: str, across: float, head: float, base: float, parameters: Mapping[str, Mark]) -> str:
     spring = parameters.get(f"{name}.stiffness", Mark("fixed"))
     damper = parameters.get(f"{name}.damping", Mark("fixed"))
-    told = f"{spring.words('spring')}; {damper.words('damper')}"
+    caption = f"{spring.words('spring')}; {damper.words('damper')}"
     top, bottom = head + 18, base - 18
     swing = np.r_[0.0, np.tile([8.0, -8.0], 4), 0.0]
     turns = np.linspace(top, bottom, len(swing))
@@ -203,7 +203,7 @@ def _element(name: str, short: str, across: float, head: float, base: float, par
     x, cup = across + 15, bottom - 0.35 * (bottom - top)
     return (
         f'<a href="#{escape(name)}" data-element="{escape(name)}" class="element">'
-        f"<title>{escape(f'{name}: {told}')}</title>"
+        f"<title>{escape(f'{name}: {caption}')}</title>"
         f'<rect class="hit" x="{across - 32:.1f}" y="{head:.1f}" width="64" height="{base - head:.1f}"/>'
         f'<g class="spring {spring.state}"><path d="M{across - 15:.1f},{head:.1f}V{top:.1f}M{across - 15:.1f},'
         f'{bottom:.1f}V{base:.1f}"/><polyline points="{zigzag}"/></g>'

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sprung.model.identification.estimates import WITHOUT_VALUES
-from sprung.service.monitoring.views import VehicleView, size_in_words, suspected, told, unclear
+from sprung.service.monitoring.views import VehicleView, changed_part, size_in_words, suspected, unclear
 from sprung.service.rendering.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason
@@ -89,7 +89,9 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
             else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew."
         )
         unsure = unclear(worst.alternatives)
-        found.append(Hint(level, f"{told(worst)} has changed{by}{many}", f"{_since(worst)}. {unsure}{what} {ask}"))
+        found.append(
+            Hint(level, f"{changed_part(worst)} has changed{by}{many}", f"{_since(worst)}. {unsure}{what} {ask}")
+        )
     misfit = next((a for a in active if a.kind == "misfit"), None)
     if misfit is not None:
         cause = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."

@@ -170,15 +170,15 @@ def _ended(fed: Fed, ending: Ending) -> None:
 def ride_dict(ride: comfort.RideQuality) -> dict[str, Any]:
     """The comfort of a ride, and of each of its latest minutes."""
     minutes = ride.by_minute()[-MOST_MINUTES:]
-    return ride.summary() | {"by_minute": [{"start": to_iso(start), "sensors": told} for start, told in minutes]}
+    return ride.summary() | {"by_minute": [{"start": to_iso(start), "sensors": figures} for start, figures in minutes]}
 
 
 def comfort_dict(pipeline: Pipeline, fed: Fed) -> dict[str, Any]:
     """The ride's comfort, and what the changes from the vehicle's own baseline cost of it on an average track."""
-    told = ride_dict(fed.ride) if fed.ride is not None else {"minutes": 0, "sensors": {}}
+    figures = ride_dict(fed.ride) if fed.ride is not None else {"minutes": 0, "sensors": {}}
     if fed.state is None:
-        return told | {"cost": None}
-    return told | {"cost": rides.cost(pipeline.engine, fed.state)}
+        return figures | {"cost": None}
+    return figures | {"cost": rides.cost(pipeline.engine, fed.state)}
 
 
 def _count(fed: Fed, batch: Batch) -> Batch:

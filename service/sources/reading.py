@@ -99,22 +99,22 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     beside = AuxiliaryMeans(len(system.channels), len(system.auxiliary))
     held: list[Window] = []
     whole = 0
-    told = time.monotonic()
+    reported = time.monotonic()
 
-    def tell() -> None:
-        nonlocal held, told
+    def report() -> None:
+        nonlocal held, reported
         emit(ReadWindows(held, _copy(recording.tally), recording.vehicle))
-        held, told = [], time.monotonic()
+        held, reported = [], time.monotonic()
 
     for block in paced(recording.at_rate(system.sample_rate, beside.keep), request.speed):
         for window in windower.push(block):
             held.append(beside.to(window))
             whole += 1
             if len(held) >= request.batch_windows:
-                tell()
-        if time.monotonic() - told > SIGN_OF_LIFE_SECONDS:
+                report()
+        if time.monotonic() - reported > SIGN_OF_LIFE_SECONDS:
             emit(ReadWindows([], _copy(recording.tally), recording.vehicle))
-            told = time.monotonic()
+            reported = time.monotonic()
     last = windower.flush()
     held += [beside.to(window) for window in last]
     for first in range(0, len(held), request.batch_windows):

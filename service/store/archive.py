@@ -182,8 +182,8 @@ def _plain(row: Any) -> dict[str, Any]:
     del values["model_id"]
     for name in ARRAYS:
         values[name] = None if values[name] is None else unpack(values[name])
-    told = values["identifiable"]
-    values["identifiable"] = None if told is None else [bool(one) for one in told]
+    identifiable = values["identifiable"]
+    values["identifiable"] = None if identifiable is None else [bool(one) for one in identifiable]
     return values
 
 

@@ -59,13 +59,13 @@ def _of_windows(
     width = round(resolution * NANOSECONDS)
     time = windows.c.start_ns
     point = time - time % width if width else time
-    told = func.max(case((windows.c.outcome == UNINFORMATIVE, 0), else_=1))
+    informative = func.max(case((windows.c.outcome == UNINFORMATIVE, 0), else_=1))
     query = (
         select(point)
         .where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id, windows.c.posterior.is_not(None))
         .where(time >= since, time < until)
         .group_by(point)
-        .having(told == 0)
+        .having(informative == 0)
         .order_by(point.desc())
         .limit(most)
     )

@@ -72,10 +72,10 @@ class WindowLoads:
 
     def text(self) -> str | None:
         """JSON, as the store keeps it; None where nothing is told."""
-        told = {
+        identified = {
             body: [self.estimated.get(body), self.believed.get(body)] for body in {**self.estimated, **self.believed}
         }
-        return json.dumps(told, separators=(",", ":")) if told else None
+        return json.dumps(identified, separators=(",", ":")) if identified else None
 
 
 @dataclass(frozen=True, slots=True)

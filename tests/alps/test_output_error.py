@@ -71,7 +71,7 @@ def test_an_affine_image_of_the_states_scores_as_the_states() -> None:
         assert metrics.relative_state_error(task, seen, true) > 0.5
 
 
-def test_comparisons_are_paired_and_tell_the_better_from_the_equal(tmp_path: Path) -> None:
+def test_comparisons_are_paired_and_separate_the_better_from_the_equal(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for seed in range(2):
         difficulty = rng.lognormal(0, 2, 60)  # trajectories differ far more than methods

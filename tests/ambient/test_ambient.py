@@ -143,7 +143,7 @@ def test_periodograms_of_a_long_record_have_the_modelled_spectrum(vehicle: Syste
     assert np.einsum("fii->i", whitened).real / len(whitened) == pytest.approx(np.ones(9), abs=0.08)
 
 
-def test_a_minute_of_accelerometers_tells_every_parameter_speed_and_load(vehicle: System) -> None:
+def test_a_minute_of_accelerometers_identifies_every_parameter_speed_and_load(vehicle: System) -> None:
     rng = np.random.default_rng(5)
     ride = draw_ride(rng)
     fit = AmbientIdentifier(vehicle).fit(record(rng, ride, 60.0))
@@ -193,7 +193,7 @@ def test_estimates_say_what_they_do_not_know(vehicle: System) -> None:
     assert np.allclose(np.diag(seen.covariance)[~seen.identifiable], 1.0)
 
 
-def test_standstill_tells_nothing_and_raises_nothing(vehicle: System) -> None:
+def test_standstill_is_uninformative_and_raises_nothing(vehicle: System) -> None:
     rng = np.random.default_rng(8)
     still = rng.normal(size=(1, 6000, 12)) * vehicle.sensor_noise
     (seen,) = AmbientIdentifier(vehicle).identify(still)
@@ -281,7 +281,7 @@ def shaken_tower(rng: np.random.Generator, seconds: float, force: float, start: 
 TRUTH = np.log([4.6e5 / 4e5, 2.7e5 / 3e5, 500 / 400, 260 / 300])
 
 
-def test_a_structure_under_unmeasured_forces_tells_its_springs_and_dampers() -> None:
+def test_springs_and_dampers_of_a_structure_are_identified_under_unmeasured_forces() -> None:
     system = parse_system(TOWER)
     values = shaken_tower(np.random.default_rng(11), 120.0, 50.0)
     (seen,) = load_identifier(system).identify(values[None, :6000])
@@ -299,7 +299,7 @@ def test_a_free_decay_is_identified_as_one() -> None:
     assert np.abs(seen.log_ratio - TRUTH).max() < 0.01
 
 
-def test_identifiability_without_inputs_is_what_a_window_then_tells() -> None:
+def test_identifiability_without_inputs_is_the_accuracy_of_a_window() -> None:
     system = parse_system(TOWER)
     fit = identifiability(system)
     (seen,) = load_identifier(system).identify(shaken_tower(np.random.default_rng(13), 120.0, 50.0)[None, :6000])
@@ -307,7 +307,7 @@ def test_identifiability_without_inputs_is_what_a_window_then_tells() -> None:
     assert (fit[:2] < 0.03).all()
 
 
-def test_identifiability_of_a_vehicle_on_a_track_is_what_a_minute_then_tells(vehicle: System) -> None:
+def test_identifiability_of_a_vehicle_on_a_track_is_the_accuracy_of_a_minute(vehicle: System) -> None:
     fit = identifiability(vehicle)
     assert fit[:8].max() < 0.03 and fit[12:20].max() < 0.1
     with pytest.raises(SystemFileError, match=r"window: 1 s is too short .* a minute \(6000\)"):

@@ -5,6 +5,6 @@ from __future__ import annotations
 from sprung.benchmarks.identify import _paper_sensing
 
 
-def test_all_states_measured_tell_the_parameters_to_the_bound() -> None:
+def test_all_states_measured_identify_the_parameters_to_the_bound() -> None:
     (row,) = _paper_sensing(4)
     assert row["value"] < 2 * row["bound"] < 1.0

@@ -86,7 +86,7 @@ def test_rows_of_other_code_are_refused(tmp_path: Path) -> None:
         list(paper_report.run(tmp_path, document))
 
 
-def test_a_method_that_is_worse_on_every_seed_is_told_from_one_that_is_worse_on_one(tmp_path: Path) -> None:
+def test_a_method_that_is_worse_on_every_seed_is_distinguished_from_one_that_is_worse_on_one(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for seed in range(3):
         base = rng.uniform(1, 2, 60)

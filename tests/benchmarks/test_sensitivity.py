@@ -36,7 +36,7 @@ def varied(stage: str, name: str) -> dict[str, Any] | None:
     return vary(cast(Subject, Obedient()), stage, number)
 
 
-def test_a_change_is_told_with_the_value_that_made_it() -> None:
+def test_a_change_is_reported_with_the_value_that_made_it() -> None:
     told = varied("verdict", "clear")  # 1.25 to 2.0
     assert told is not None
     (change,) = told["changed"]

@@ -10,7 +10,7 @@ from sprung.benchmarks.trust_scarcity import SCARCITIES, missing, scarcity
 
 
 @pytest.mark.slow
-def test_what_is_lacking_is_told_and_survived(tmp_path: Path) -> None:
+def test_what_is_lacking_is_reported_and_survived(tmp_path: Path) -> None:
     if reason := missing():
         pytest.skip(f"no disk of its own: {reason}")
     *lines, audit = scarcity(tmp_path, 4.0)

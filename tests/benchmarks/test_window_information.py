@@ -29,7 +29,7 @@ def sine(*slopes: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(slopes, dim=-1)[None, :, None], chart[None, :, None]
 
 
-def test_an_amplitude_is_told_as_well_by_magnitudes() -> None:
+def test_an_amplitude_is_identified_as_well_from_magnitudes() -> None:
     by_phase, by_amplitude = 2 * torch.cos(TURN * TIME + 0.3), torch.sin(TURN * TIME + 0.3)
     jacobian, chart = sine(by_phase, by_amplitude)
     expected = math.sqrt(2 / math.pi) * 0.01 * math.sqrt(2 / WINDOW)  # deviation of an amplitude: s sqrt(2 / T)
@@ -38,14 +38,14 @@ def test_an_amplitude_is_told_as_well_by_magnitudes() -> None:
     assert math.isclose(information.bound(kept, 0.01, 1e3), expected, rel_tol=1e-4)
 
 
-def test_a_phase_is_not_told_by_magnitudes() -> None:
+def test_a_phase_is_not_identifiable_from_magnitudes() -> None:
     jacobian, chart = sine(2 * torch.cos(TURN * TIME + 0.3))
     assert information.bound(jacobian, 0.01, 1.0) < 0.002
     lost = information.bound(information.seen_in_magnitudes(jacobian, chart), 0.01, 1.0)
     assert math.isclose(lost, math.sqrt(2 / math.pi), rel_tol=1e-2)  # the prior
 
 
-def test_magnitudes_never_tell_more_than_states() -> None:
+def test_magnitudes_are_never_more_informative_than_states() -> None:
     for task in (pendulum.TASK, mass_spring_damper.TASK, two_body.TASK):
         jacobian, charts = information.sensitivity(task, few(task))
         span = task.seen.high[0] - task.seen.low[0]
@@ -75,7 +75,7 @@ def test_the_responses_to_single_inputs_add_up_to_the_window() -> None:
     torch.testing.assert_close(factor @ pushes, task.to_chart(drawn.states[2, 5 : 5 + WINDOW]), rtol=1e-8, atol=1e-8)
 
 
-def test_inputs_that_are_known_tell_far_more() -> None:
+def test_known_inputs_are_far_more_informative() -> None:
     task = mass_spring_damper.TASK
     drawn = task.sample(12, np.random.default_rng(1), task.seen)
     jacobian, _ = information.sensitivity(task, drawn)

@@ -53,7 +53,7 @@ def test_a_flat_on_one_wheel_is_found_named_and_sized() -> None:
 
 
 @pytest.mark.slow
-def test_rail_joints_are_told_from_a_flat_by_the_other_wheel() -> None:
+def test_rail_joints_are_distinguished_from_a_flat_by_the_other_wheel() -> None:
     record = HealthyRecord(32)
     for wheel in ("wheel_21l", "wheel_21r"):
         record.hide_dip("rail_joints", wheel, 3e-4, 1.7, 0.6)

@@ -35,7 +35,7 @@ def test_dry_friction_is_found_named_and_sized() -> None:
     assert first.look_alikes["bouc_wen"] > 20  # odds against what similar data may suggest
 
 
-def test_what_a_recording_does_not_tell_apart_is_called_a_family() -> None:
+def test_laws_that_a_recording_does_not_distinguish_are_called_a_family() -> None:
     """A weak friction that turns slowly, and a valve that opens at a low rate."""
     report = _diagnose(simulate(lambda d, v: 10 * np.tanh(v / 0.006), seed=21, seconds=30))
     (finding,) = report.findings
@@ -105,7 +105,7 @@ def test_stuck_sensor_is_named_and_left_out() -> None:
     assert "car_b" not in report.baseline_validation.per_sensor
 
 
-def test_noisy_sensor_is_told_from_physics() -> None:
+def test_noisy_sensor_is_distinguished_from_physics() -> None:
     record = simulate(seed=25)
     rng = np.random.default_rng(0)
     record.values[:, 2] += 0.01 * rng.standard_normal(len(record.values))
@@ -159,7 +159,7 @@ def test_valve_that_takes_nearly_all_of_the_damping_is_no_friction() -> None:
         assert abs(parameter.value - truth) < max(4 * parameter.std, 0.03 * truth)
 
 
-def test_a_force_that_no_law_explains_is_told_as_a_formula_with_its_values() -> None:
+def test_a_force_that_no_law_explains_is_reported_as_a_formula_with_its_values() -> None:
     report = _diagnose(simulate(lambda d, v: 120 * np.sin(d / 6e-4), seed=29))
     assert report.verdict == "unknown_physics"
     assert [(f.location, f.effect, f.formula) for f in report.findings] == [("secondary", "formula", "a * sin(d / L)")]

@@ -52,7 +52,7 @@ def test_what_is_no_such_fmu_is_refused_in_one_line(exported: Path, tmp_path: Pa
         assert "\n" not in str(refused.value) and str(path) in str(refused.value)
 
 
-def test_inputs_that_are_no_pairs_are_told_by_name() -> None:
+def test_inputs_that_are_no_pairs_are_reported_by_name() -> None:
     assert _pairs(Path("a"), ["road.displacement", "road.velocity", "wall"]) == (("road", "wall"), [0, 1, 2, -1])
     assert _pairs(Path("a"), ["der(road)", "road"]) == (("road",), [1, 0])
     with pytest.raises(ExchangeError, match=r"road.velocity is a velocity without road.displacement"):

@@ -80,7 +80,7 @@ def test_neither_springs_nor_loads_nor_gains_make_a_contradiction(
     assert not contradictions.contradicted(values).any()
 
 
-def test_an_exchange_that_cannot_be_told_from_another_is_said_to_be_one_of_both() -> None:
+def test_an_exchange_that_cannot_be_distinguished_from_another_is_said_to_be_one_of_both() -> None:
     """Springs at two supports of one mass: exchanged displacements are exchanged velocities and exchanged springs."""
     system = parse_system(TWO_SUPPORTS)
     runs = simulate_runs(system, np.zeros((4, 4)), system.window, np.random.default_rng(2)).values

@@ -53,7 +53,7 @@ def test_its_start_needs_fewer_iterations_than_nominal_values(vehicle: tuple[Sys
     assert trained <= 0.5 * nominal
 
 
-def test_the_manifest_tells_how_the_weights_came_about() -> None:
+def test_the_manifest_records_how_the_weights_were_trained() -> None:
     manifest = json.loads((WEIGHTS / "manchester" / "manifest.json").read_text())
     assert manifest["system_digest"] == load_system().digest
     assert manifest["measured"]["coverage_95"] > 0.9
@@ -182,7 +182,7 @@ def test_linear_changes_of_masses_become_the_terms_of_a_load() -> None:
 
 
 @pytest.mark.parametrize("body", ["bogie2", "car"])
-def test_a_body_without_any_sensor_does_not_lead_the_refinement_astray(body: str) -> None:
+def test_refinement_converges_beside_a_body_without_any_sensor(body: str) -> None:
     system = load_system()
     rng = np.random.default_rng(6)
     truth = np.log(rng.uniform(0.9, 1.1, (4, 24)))

@@ -75,7 +75,7 @@ def test_a_lasting_fault_is_found_again_by_one_refinement_with_the_same_values(
         np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-6, atol=1e-12)
 
 
-def test_a_frozen_input_is_told_again_by_one_refinement(system: System, samples: FloatArray) -> None:
+def test_a_frozen_input_is_found_again_by_one_refinement(system: System, samples: FloatArray) -> None:
     values = windows(system, samples, hop=100)[1:3]
     values[:, :, 3] = 0.1
     known: list[Faults] = [(MeasurementFault("wheel_11r.velocity", "frozen", 0.2),)] * 2
@@ -90,7 +90,7 @@ def test_a_frozen_input_is_told_again_by_one_refinement(system: System, samples:
     ("channel", "kind"),
     [("bogie1_1l|bogie1_2l", "swapped"), ("wheel_21l.velocity", "inverted"), ("bogie1_1r", "frozen")],
 )
-def test_a_repaired_channel_is_not_believed_to_be_wrong_any_more(
+def test_a_repaired_channel_is_not_accepted_to_be_wrong_any_more(
     system: System, samples: FloatArray, channel: str, kind: Any
 ) -> None:
     values = windows(system, samples, hop=100)[1:3]

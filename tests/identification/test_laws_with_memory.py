@@ -47,7 +47,7 @@ def hysteretic() -> np.ndarray:
     return np.stack([values[i : i + 200] for i in range(200, 1951, 150)])
 
 
-def test_a_hysteretic_part_and_its_element_are_found_with_honest_deviations(hysteretic: np.ndarray) -> None:
+def test_a_hysteretic_part_and_its_element_are_found_with_calibrated_deviations(hysteretic: np.ndarray) -> None:
     vehicle = strut(BOUC_WEN)
     truth = np.log([1.0, 22 / 20, 14 / 15, 12 / 14])
     estimates = load_identifier(vehicle).identify(hysteretic)

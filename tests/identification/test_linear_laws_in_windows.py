@@ -65,7 +65,7 @@ def rides(system: System, seconds: float = 22.0) -> np.ndarray:
     ("name", "friction"),
     [*((name, "") for name in LAWS), ("missing_connection", FRICTION), ("suspended_mass", FRICTION)],
 )
-def test_values_of_a_linear_law_are_found_beside_springs_with_honest_deviations(name: str, friction: str) -> None:
+def test_values_of_a_linear_law_are_found_beside_springs_with_calibrated_deviations(name: str, friction: str) -> None:
     vehicle = half_car(LAWS[name], friction)
     estimates = load_identifier(vehicle).identify(rides(vehicle))
     own = [i for i, p in enumerate(vehicle.tracked) if name in p.quantity]

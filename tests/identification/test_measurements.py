@@ -179,7 +179,7 @@ def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system: System, i
     assert np.abs(drift).max() < 0.025
 
 
-def test_a_large_delay_from_the_first_window_on_is_believed_at_once(system: System, identifier: Identifier) -> None:
+def test_a_large_delay_from_the_first_window_on_is_accepted_at_once(system: System, identifier: Identifier) -> None:
     tracker, state = tracked(system, identifier, late(record(20, 8), [8], 0.03))
     assert state.rejected <= 6 and not state.alarms
     assert {(f.channel, f.kind) for f in tracker.sensors(state)} == {("wheel_21l.displacement", "delay")}

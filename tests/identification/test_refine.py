@@ -52,7 +52,7 @@ def test_errors_are_what_the_intervals_say_from_nominal_and_from_a_near_start(
     assert near.iterations.mean() < 0.6 * from_nominal.iterations.mean()
 
 
-def test_windows_that_hardly_tell_anything_come_to_rest() -> None:
+def test_refinement_of_hardly_informative_windows_converges() -> None:
     system = load_system()
     slow = simulate_runs(system, np.zeros((24, 24)), system.window, np.random.default_rng(3), speed=(2.0, 3.0))
     refined = Refiner(system).refine(slow.values, loads=True, built=True)
@@ -60,7 +60,7 @@ def test_windows_that_hardly_tell_anything_come_to_rest() -> None:
     assert refined.iterations.mean() < 3
 
 
-def test_windows_say_how_much_of_what_they_tell_is_noise_of_their_inputs() -> None:
+def test_windows_state_the_share_of_input_noise_in_their_information() -> None:
     system = load_system()
     noise = []
     for speed in (6.0, 40.0):
@@ -122,7 +122,7 @@ def test_a_body_without_any_sensor_leaves_the_windows_of_the_others(
     assert np.abs(scores(refined, truth[:count])).max() < 5
 
 
-def test_a_standing_vehicle_tells_nothing_and_says_so() -> None:
+def test_a_standing_vehicle_is_uninformative_and_says_so() -> None:
     system = load_system()
     noise = np.array([c.noise for c in system.channels])
     windows = noise * np.random.default_rng(0).standard_normal((2, 100, 28))
@@ -185,7 +185,7 @@ def test_magnitudes_are_the_absolute_discrete_fourier_transform() -> None:
     assert np.allclose(features[1, :, 2], np.abs(np.fft.fft(signal[1, :, 2].numpy()))[:17])
 
 
-def test_identifiability_names_what_a_window_cannot_tell() -> None:
+def test_identifiability_names_what_a_window_does_not_determine() -> None:
     std = identifiability(load_system())
     assert np.all(std < 0.05)
     assert std[12:20].min() > std[:8].max()  # primary dampings are the hardest

@@ -56,7 +56,7 @@ def test_errors_are_what_the_intervals_say_and_offsets_do_not_matter(mix: str) -
 
 
 @pytest.mark.parametrize("mix", MIXES)
-def test_more_signals_of_one_motion_tell_more_never_less(mix: str) -> None:
+def test_more_signals_of_one_motion_are_more_informative_never_less(mix: str) -> None:
     system, truth = car(mix), np.zeros((8, 4))
     std = {}
     for less in [mix, *(one for one in "dva" if one in mix)]:

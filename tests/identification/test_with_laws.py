@@ -25,7 +25,7 @@ def windows() -> np.ndarray:
     return np.stack([values[i : i + 200] for i in range(200, 6000, 200)])
 
 
-def test_values_of_the_law_and_the_element_are_found_with_honest_deviations(windows: np.ndarray) -> None:
+def test_values_of_the_law_and_the_element_are_found_with_calibrated_deviations(windows: np.ndarray) -> None:
     vehicle = strut(FRICTION)
     truth = np.log([1.0, 22 / 20, 14 / 15, 60 / 50])
     estimates = load_identifier(vehicle).identify(windows)
@@ -104,7 +104,7 @@ def test_a_window_that_cannot_be_simulated_says_so(windows: np.ndarray, law: str
         assert estimate.reason is not None and estimate.reason.startswith("cannot be simulated: ")
 
 
-def test_a_window_at_standstill_tells_nothing() -> None:
+def test_a_window_at_standstill_is_uninformative() -> None:
     still = np.random.default_rng(2).normal(0, [1e-5, 5e-4, 0.03, 0.01, 2.0], (2, 200, 5))
     for estimate in load_identifier(strut(FRICTION)).identify(still):
         assert not estimate.informative
@@ -129,7 +129,7 @@ def _pooled(estimates: list[Estimate]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("channel", [0, 3])
-def test_a_gain_beside_a_law_is_told(windows: np.ndarray, channel: int) -> None:
+def test_a_gain_beside_a_law_is_reported(windows: np.ndarray, channel: int) -> None:
     wrong = windows.copy()
     wrong[:, :, channel] *= 1.02
     identifier = load_identifier(strut(FRICTION))
@@ -148,7 +148,7 @@ def test_a_wrong_sensor_beside_a_law_is_taken_back(windows: np.ndarray) -> None:
     assert all({fault.channel for fault in e.faults} == {"car_a"} for e in mended if e.adequate)
 
 
-def test_a_load_beside_a_law_is_told_and_biases_nothing(windows: np.ndarray) -> None:
+def test_a_load_beside_a_law_is_reported_and_biases_nothing(windows: np.ndarray) -> None:
     light = parse_system(TEXT.format(law=FRICTION, sensor="").replace("{mass: 400}", "{mass: 360, load: true}"))
     estimates = load_identifier(light).identify(windows)
     truth, load = np.log([1.0, 22 / 20, 14 / 15, 60 / 50]), np.log(400 / 360)

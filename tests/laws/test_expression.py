@@ -65,7 +65,7 @@ def test_only_arithmetic_is_admitted(text: str) -> None:
         parse(text, {"d", "v"})
 
 
-def test_an_unknown_name_is_told_with_those_that_exist() -> None:
+def test_an_unknown_name_is_reported_with_those_that_exist() -> None:
     with pytest.raises(FormulaError, match="'stiffnes' is none of d, stiffness"):
         parse("stiffnes * d", {"stiffness", "d"})
 

@@ -75,7 +75,7 @@ def test_a_formula_is_a_law() -> None:
         ("[{bump_stop: {gap: 1, stiffness: 2}, clearance: {gap: 1}}]", "laws"),
     ],
 )
-def test_a_wrong_law_is_told_by_its_key(text: str, said: str) -> None:
+def test_a_wrong_law_is_reported_by_its_key(text: str, said: str) -> None:
     with pytest.raises(SystemFileError, match="strut") as told:
         system(f", laws: {text}")
     assert said in str(told.value) and "\n" not in str(told.value)

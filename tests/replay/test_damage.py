@@ -166,7 +166,7 @@ def test_damaged_text_is_counted_and_the_rest_is_read(name: str, tmp_path: Path,
         (b"MDF     4.1", "an MDF file of version 4.1 that cannot be read: damaged"),
     ],
 )
-def test_a_file_that_is_no_mdf_is_told_in_plain_words(content: bytes, told: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_mdf_is_reported_in_plain_words(content: bytes, told: str, tmp_path: Path) -> None:
     pytest.importorskip("asammdf")
     path = tmp_path / "a.mf4"
     path.write_bytes(content)

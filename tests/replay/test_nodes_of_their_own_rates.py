@@ -59,7 +59,7 @@ def write(path: Path, values: FloatArray) -> None:
         writer.finish()
 
 
-def test_nodes_of_200_to_2000_hz_and_a_force_gauge_in_volts_tell_the_true_values(tmp_path: Path) -> None:
+def test_nodes_of_200_to_2000_hz_and_a_force_gauge_in_volts_give_the_true_values(tmp_path: Path) -> None:
     fine = parse_system(SYSTEM.format(rate=FINE))
     values = simulate_runs(fine, TRUTH[None], FINE * SECONDS, np.random.default_rng(4)).values[0]
     values[:, 4] /= 200.0

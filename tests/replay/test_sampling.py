@@ -241,7 +241,7 @@ def test_a_record_beyond_any_memory_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("scatter", [0.03, 0.2, 0.4])
-def test_uneven_stamps_are_believed_where_the_samples_were_taken_then(tmp_path: Path, scatter: float) -> None:
+def test_uneven_stamps_are_accepted_where_the_samples_were_taken_then(tmp_path: Path, scatter: float) -> None:
     """A table's stamps scatter: either the samples do too, or only the stamps; the signal tells which."""
     rng = np.random.default_rng(2)
     even = np.arange(2000) / 200.0

@@ -29,24 +29,24 @@ NOISE: FloatArray = np.random.default_rng(1).normal(0, 1, 2000)
 LEVEL: FloatArray = 9.81 + 0.01 * NOISE
 
 
-def test_nothing_is_told_of_a_recording_in_order(tmp_path: Path) -> None:
+def test_nothing_is_reported_of_a_recording_in_order(tmp_path: Path) -> None:
     assert table(tmp_path / "a.csv", SECONDS, np.round(NOISE), NOISE) == []  # round numbers pass through 0 often
 
 
-def test_samples_that_are_there_twice_are_told_with_count_and_place(tmp_path: Path) -> None:
+def test_samples_that_are_there_twice_are_reported_with_count_and_place(tmp_path: Path) -> None:
     rows = np.sort(np.r_[np.arange(2000), np.arange(700, 710)])
     told = table(tmp_path / "a.csv", SECONDS[rows], NOISE[rows], LEVEL[rows])
     assert told == ["samples that are there twice: 20, the first after 7.00 s (left, right)"]
 
 
-def test_zeros_that_stand_for_missing_values_are_told(tmp_path: Path) -> None:
+def test_zeros_that_stand_for_missing_values_are_reported(tmp_path: Path) -> None:
     wrong = LEVEL.copy()
     wrong[[300, 500, 900]] = 0.0
     told = table(tmp_path / "a.csv", SECONDS, NOISE, wrong)
     assert told == ["single values of 0 between others far from it: 3, the first after 3.00 s (right)"]
 
 
-def test_a_clock_that_leaps_ahead_and_a_pause_are_told(tmp_path: Path) -> None:
+def test_a_clock_that_leaps_ahead_and_a_pause_are_reported(tmp_path: Path) -> None:
     told = table(tmp_path / "a.csv", SECONDS + 5.5 * (SECONDS > 10), NOISE, LEVEL)
     assert told == ["nothing for more than 5 s, once: 5.51 s until 2026-09-21T14:13:35Z"]
 

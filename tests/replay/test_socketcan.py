@@ -89,7 +89,7 @@ def listener(can0: Interface) -> Iterator[CollectingListener]:
     listening.stop()
 
 
-def test_the_kernel_is_told_which_frames_are_wanted(can0: Interface, listener: CollectingListener) -> None:
+def test_the_kernel_is_reported_which_frames_are_wanted(can0: Interface, listener: CollectingListener) -> None:
     assert listener.wait(lambda: listener.bus.connected)
     filters = [value for option, value in can0.told if option == constants.CAN_RAW_FILTER]
     assert filters[-1] == struct.pack("=II", 0x123, 0x7FF | constants.CAN_EFF_FLAG)  # that id, and no extended one
@@ -115,7 +115,7 @@ def test_an_interface_that_goes_down_or_away_is_taken_up_again(can0: Interface, 
 
 
 @pytest.mark.parametrize("back", [pytest.param(0x100 | ERROR, id="restarted"), pytest.param(0x123, id="a frame")])
-def test_a_controller_that_is_off_the_bus_is_told(can0: Interface, listener: CollectingListener, back: int) -> None:
+def test_a_controller_that_is_off_the_bus_is_reported(can0: Interface, listener: CollectingListener, back: int) -> None:
     live = listener.bus
     assert listener.wait(lambda: live.connected)
     can0.send(0, 0x04 | ERROR)  # trouble of the controller, of which there is much

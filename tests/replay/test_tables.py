@@ -120,7 +120,7 @@ def test_a_first_column_that_does_not_rise_is_no_time(tmp_path: Path) -> None:
     assert len(record.values) == 400
 
 
-def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path: Path) -> None:
+def test_two_columns_of_one_name_are_distinguished_by_number(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table(before="time,x,x\n"))
     with pytest.raises(
         UnreadableRecording, match=r"2 columns are called 'x'; select one by its number: `column: 2` or 3"

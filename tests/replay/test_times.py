@@ -63,7 +63,7 @@ def test_a_clock_that_is_set_begins_a_new_segment(step: float) -> None:
         assert told == []  # a pause
 
 
-def test_the_reason_why_no_window_can_be_made_is_told() -> None:
+def test_the_reason_why_no_window_can_be_made_is_reported() -> None:
     short, windower = cut(block(TEN[:50]))
     assert "a window needs 1 s, their longest stretch is 0.49 s" in remarks(windower, len(short))[0]
     still, windower = cut(block(np.zeros(3000)))

@@ -98,7 +98,7 @@ def test_a_message_that_is_none_costs_itself(message: bytes, tmp_path: Path) -> 
     assert not any("Error" in line for line in recording.problems)
 
 
-def test_a_message_of_another_era_is_left_out_and_told(tmp_path: Path) -> None:
+def test_a_message_of_another_era_is_left_out_and_reported(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_mcap(path, b'{"left": 0.5}', publish=(1 << 64) - 1)
     recording, samples = read(path)

@@ -58,7 +58,7 @@ def test_a_disk_that_fills_is_not_ready(client: TestClient, monkeypatch: pytest.
         (RuntimeError("a mistake of ours"), 500),
     ],
 )
-def test_what_is_lacking_is_told_as_what_it_is(
+def test_what_is_lacking_is_reported_as_what_it_is(
     client: TestClient, core: Core, monkeypatch: pytest.MonkeyPatch, error: Exception, status: int
 ) -> None:
     reading = core.store.read

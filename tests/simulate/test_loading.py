@@ -77,7 +77,7 @@ def test_a_body_without_axes_has_a_mass_alone() -> None:
     assert [term.kind for term in load_terms(parse_system(QUARTER_CAR))] == ["load"]
 
 
-def test_windows_tell_where_goods_lie_and_blame_no_spring(system: System) -> None:
+def test_windows_determine_where_goods_lie_and_change_no_spring(system: System) -> None:
     x = np.tile(np.concatenate([np.zeros(24), described()]), (24, 1))
     runs = simulate_runs(system, x, system.window, np.random.default_rng(3))
     alone = Refiner(system).refine(runs.values)
@@ -108,7 +108,7 @@ def test_what_windows_say_of_a_load_does_not_hold_their_prior(system: System) ->
     assert std[3] < 0.01 and std[4] < 0.01
 
 
-def test_stiffness_that_follows_the_load_is_told_as_that_of_the_empty_body() -> None:
+def test_stiffness_that_follows_the_load_is_reported_as_that_of_the_empty_body() -> None:
     """Air springs: at 20 % more weight they are 20 % stiffer, and nothing has changed."""
     text = MANCHESTER.read_text()
     aired = re.sub(r"(secondary_\d[lr]: \{)", r"\1by_load: 1, ", text)

@@ -113,7 +113,7 @@ def test_less_than_the_least_is_an_alarm_too() -> None:
     assert alarm.change is not None and alarm.change < 0
 
 
-def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
+def test_pressure_determines_the_load_at_once_when_its_constant_is_known() -> None:
     rng = np.random.default_rng(4)
     tracker = follow()
     state, at = with_its_gauge_known(rng, tracker)
@@ -125,7 +125,7 @@ def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
     assert state.cargo is not None and state.cargo.prior_variance[0] < 0.02**2
 
 
-def test_a_gauge_that_is_stuck_falsifies_no_load_for_long_and_is_soon_not_believed() -> None:
+def test_a_gauge_that_is_stuck_falsifies_no_load_for_long_and_is_soon_not_accepted() -> None:
     rng = np.random.default_rng(6)
     tracker = follow()
     wrong: list[bool] = []
@@ -206,7 +206,7 @@ def test_windows_without_what_they_say_of_loads_are_not_moved_by_the_load_again(
     assert np.abs(tracker.posterior(state)[0]).max() < 0.02
 
 
-def test_after_a_stop_the_load_is_that_of_the_ride_before_until_a_window_tells_of_the_new_one() -> None:
+def test_after_a_stop_the_load_is_that_of_the_ride_before_until_a_window_determines_the_new_one() -> None:
     rng, tracker = np.random.default_rng(8), follow()
     state = ride(rng, tracker, tracker.initial_state(), 60, constant(0.1))
     assert tracker.loads_as_of(state) is None
@@ -218,7 +218,7 @@ def test_after_a_stop_the_load_is_that_of_the_ride_before_until_a_window_tells_o
     assert abs(tracker.loads(rides)["car"][0] - 0.3) < 0.05
 
 
-def test_a_run_that_does_not_tell_the_load_yet_leaves_that_of_the_run_before_with_its_time() -> None:
+def test_a_run_that_does_not_determine_the_load_yet_leaves_that_of_the_run_before_with_its_time() -> None:
     rng, tracker = np.random.default_rng(14), follow()
     state = ride(rng, tracker, tracker.initial_state(), 60, constant(np.log1p(0.2)))
     assert tracker.loads_as_of(state) is None

@@ -171,7 +171,7 @@ def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begi
     assert all(f.channel == "c0" and abs(f.value - 1 - to) < 3 * f.std for f in tracker.sensors(state))
 
 
-def test_gains_and_clocks_that_were_always_off_are_told_and_no_alarm() -> None:
+def test_gains_and_clocks_that_were_always_off_are_reported_and_no_alarm() -> None:
     rng, tracker = np.random.default_rng(7), make(GAINS)
     state = tracker.initial_state()
     for k in range(200):
@@ -180,7 +180,7 @@ def test_gains_and_clocks_that_were_always_off_are_told_and_no_alarm() -> None:
     assert [f.channel for f in tracker.sensors(state)] == ["c1"]
 
 
-def test_an_alarm_of_a_drift_closes_when_the_sensor_is_mended() -> None:
+def test_an_alarm_of_a_drift_closes_when_the_sensor_is_repaired() -> None:
     rng, tracker = np.random.default_rng(8), make(GAINS)
     state = tracker.initial_state()
     for k in range(900):

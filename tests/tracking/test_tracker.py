@@ -219,7 +219,7 @@ def test_wear_that_takes_a_quarter_of_an_hour_alarms() -> None:
     assert 0.015 < 1e-4 * ((alarm.opened - EPOCH) * 1e-9 - 60.0) < 0.06
 
 
-def test_components_that_a_window_does_not_tell_keep_their_prior_and_disturb_nobody() -> None:
+def test_components_that_a_window_does_not_determine_keep_their_prior_and_leave_others_alone() -> None:
     rng = np.random.default_rng(10)
     tracker = make_tracker(6)
     std = np.full(6, 0.01)

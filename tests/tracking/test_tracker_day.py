@@ -33,7 +33,7 @@ def running(
 
 
 @pytest.mark.parametrize("level", [0.3, 0.7, 1.0, 1.5])
-def test_a_stop_at_a_station_raises_nothing_and_tells_nothing(system: System, level: float) -> None:
+def test_a_stop_at_a_station_raises_nothing_and_is_uninformative(system: System, level: float) -> None:
     rng = np.random.default_rng(int(10 * level))
     parts = [running(system, 40, rng), standing(system, 40, level, rng), running(system, 15, rng)]
     estimates = Identifier(system).identify(np.concatenate(parts))

@@ -72,7 +72,7 @@ def test_a_window_that_was_not_weighed_does_not_speak_of_what_moves_it() -> None
     assert fault.channel == "c0"
 
 
-def test_a_window_that_was_not_weighed_tells_no_load_that_a_wrong_gain_has_moved() -> None:
+def test_a_window_without_evidence_on_gains_determines_no_load_that_a_wrong_gain_has_moved() -> None:
     rng = np.random.default_rng(4)
     known = [*(Deviation(f"c{i}", "gain", 0.015, i) for i in range(3)), Deviation("car", "load", 0.15, -1)]
     tracker = Tracker([TrackedParameter("element.stiffness")], None, known)

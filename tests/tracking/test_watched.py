@@ -60,7 +60,7 @@ def test_a_standing_vehicle_need_not_be_watched(conditions: Conditions | None) -
     assert tracker.health(state) == "ok"
 
 
-def test_a_vehicle_that_runs_too_slowly_to_tell_anything_is_watched_for_a_while_only() -> None:
+def test_a_vehicle_that_runs_too_slowly_to_be_identified_is_watched_for_a_while_only() -> None:
     tracker, state, covariance = learned()
     noisy = estimate(np.zeros(24), covariance, informative=False, running=True)
     held = round(tracker.settings.holding)

@@ -85,7 +85,7 @@ def test_weather_that_is_measured_raises_nothing_and_its_slope_is_learned() -> N
     assert np.all(np.abs(middle / weather.KELVIN - slope) < 3 * std / weather.KELVIN)
 
 
-def test_weather_that_nobody_measures_raises_nothing() -> None:
+def test_unmeasured_weather_raises_nothing() -> None:
     rng = np.random.default_rng(2)
     state = day(rng, tracker().initial_state(), 2880, lambda k: warm(k)[1], lambda k: None, every=5)
     assert state.alarms == ()

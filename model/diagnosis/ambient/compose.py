@@ -181,9 +181,12 @@ def _advice(
         words.append(f"only {100 * adequate:.0f} % of the windows are explained down to random errors")
     if float(np.mean(judgement.errors.floor**2)) > rules.coarse:
         words.append("too few windows to reveal a wrong structure: record longer")
-    loose = [p.name for p, std in zip(system.parameters, pooled.deviation, strict=True) if std > rules.undetermined]
-    if loose:
-        words.append(f"undecided without measured inputs: {', '.join(loose)}; longer windows determine more")
+    pairs = zip(system.parameters, pooled.deviation, strict=True)
+    undetermined = [parameter.name for parameter, std in pairs if std > rules.undetermined]
+        p.name for p, std in zip(system.parameters, pooled.deviation, strict=True) if std > rules.undetermined
+    ]
+    if undetermined:
+        words.append(f"undecided without measured inputs: {', '.join(undetermined)}; longer windows determine more")
     return words
 
 

@@ -1,7 +1,7 @@
 """Supports whose acceleration is measured beside another quantity of the same motion, and where these contradict.
 
 The motion is the spline that fits all of them with their noises as weights (`model.simulate.fusion`).  What it leaves
-of each is noise alone, independent of the motion, and tells the faults of single channels.  In the time domain no end
+of each is noise alone, independent of the motion, and shows the faults of single channels.  In the time domain no end
 of the record has to be continued, which an acceleration that is integrated twice would not forgive.
 """
 

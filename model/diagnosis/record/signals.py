@@ -1,11 +1,11 @@
 """The measured signals of a recording, sorted by role, and their spectra over one part of it.
 
-Displacement and velocity of the same support tell the same motion twice.  Both are used: the fused displacement
+Displacement and velocity of the same support are two measurements of one motion.  Both are used: the fused displacement
 
     D = (D_d / s_d^2 + (V / j w) w^2 / s_v^2) / (1 / s_d^2 + w^2 / s_v^2),   var = 1 / (1 / s_d^2 + w^2 / s_v^2)
 
-drives the model, and the difference V / j w - D_d, which is noise alone and independent of D, tells the noise levels
-and the faults of the input channels.  A measured acceleration is fused with what else there is before
+drives the model, and the difference V / j w - D_d, which is noise alone and independent of D, determines the noise
+levels and the faults of the input channels.  A measured acceleration is fused with what else there is before
 (`model.simulate.fusion`); it adds w^4 / s_a^2 to 1 / var.
 """
 
@@ -29,8 +29,8 @@ from sprung.model.system import System
 
 _UNDECLARED = 1e-3  # of a signal, noise that is not declared
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
-_SEEN = 1e-9  # of a loose motion
-_END = 9  # samples that tell the slope at an end of a record
+_SEEN = 1e-9  # of a rigid-body motion
+_END = 9  # samples that determine the slope at an end of a record
 _END_DEGREE = 4  # of the polynomial through them, of a support's motion
 _INTEGRATED_DEGREE = 7  # the same of an integrated acceleration, whose fast noise is small, and fast motion is not
 
@@ -171,7 +171,7 @@ def seen_noise(signals: Signals, declared: Noise, most: float) -> Noise:
     """Noise of supports whose displacement is measured once: no less than their own fastest changes show.
 
     A wheel or a table does not move near half the sample rate, so that white noise is what is left there.  Up to `most`
-    times what was declared; what a second measurement tells is estimated from both (`fit.noise.input_noise`).
+    times what was declared; what a second measurement shows is estimated from both (`fit.noise.input_noise`).
     """
     once = ~signals.integrated & ~np.isfinite(declared.velocity) & ~np.isfinite(declared.acceleration)
     if not once.any():

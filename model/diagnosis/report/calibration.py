@@ -30,9 +30,9 @@ def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
             parameter = input_fault_parameter(state.system, fault)
             away = abs(parameter.value - fault.term.law.absent[0]) / max(fault.std, 1e-300)
             found.append((away, fault.term, parameter))
-    told = [one for one in found if one[0] > 1]
-    told.sort(key=lambda one: -one[0])
-    return tuple(IdentifiedLaw(term.location, term.law.name, (parameter,)) for _, term, parameter in told)
+    significant = [one for one in found if one[0] > 1]
+    significant.sort(key=lambda one: -one[0])
+    return tuple(IdentifiedLaw(term.location, term.law.name, (parameter,)) for _, term, parameter in significant)
 
 
 def in_words(calibration: Sequence[IdentifiedLaw]) -> str:

@@ -115,8 +115,8 @@ class Plant:
     def steady_rate(self) -> FloatArray:
         """Velocity of damped rigid-body modes under a steady unit load, (n, n)."""
         s = self.structure
-        loose = rigid_body_modes(s.K)
-        return loose @ np.linalg.pinv(loose.T @ s.C @ loose, rcond=1e-9) @ loose.T
+        rigid = rigid_body_modes(s.K)
+        return rigid @ np.linalg.pinv(rigid.T @ s.C @ rigid, rcond=1e-9) @ rigid.T
 
     @cached_property
     def sensor_of_force(self) -> ComplexArray:

@@ -1,4 +1,4 @@
-"""Faults of measurements as candidates, told from physics by redundancy and by causality.
+"""Faults of measurements as candidates, distinguished from physics by redundancy and by causality.
 
 A wrong sensor is wrong alone: its residual is a copy (gain), a derivative (lag) or a constant (bias), while the
 other sensors on the same rigid body and the bodies that it would act on contradict it; the projection and the joint

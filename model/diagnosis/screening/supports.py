@@ -1,4 +1,4 @@
-"""Faults of the channels of a support whose motion is measured more than once, told by analytical redundancy.
+"""Faults of the channels of a support whose motion is measured more than once, detected by analytical redundancy.
 
 Displacement and velocity are compared over frequency (`record.signals`).  With an acceleration among them, they are
 compared in the time domain with the motion that fits all (`record.fused`).

@@ -24,14 +24,12 @@ def starts_of(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
     if isinstance(candidate.term.law, StructureLaw):
         return structure_starts(problem, base, candidate)
     starts = [joint_start(problem, base, candidate), *_further_starts(problem, base, candidate)]
-    if _astray(problem, base) and _strengths(
-        candidate.term.law
-    ):  # parameters far off nominal have absorbed a gross law
+    if _far_from_nominal(problem, base) and _strengths(candidate.term.law):  # parameters have absorbed a gross law
         starts.append(joint_start(problem, base, candidate, nominal=True))
     return starts
 
 
-def _astray(problem: Problem, base: Fit) -> bool:
+def _far_from_nominal(problem: Problem, base: Fit) -> bool:
     """Whether any parameter is far off nominal."""
     far: float = np.max(np.abs(base.point.theta), initial=0.0)
     return far > problem.rules.selection.far
@@ -59,7 +57,7 @@ def structure_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[
     If the present parameters are far off nominal, having absorbed a gross part, also after a step from nominal.
     """
     starts = []
-    for nominal in (False, True)[: 2 if _astray(problem, base) else 1]:
+    for nominal in (False, True)[: 2 if _far_from_nominal(problem, base) else 1]:
         start = start_of(base, candidate)
         start = replace(start, theta=np.zeros_like(start.theta)) if nominal else start
         beside = joint_start(problem, base, candidate, nominal)

@@ -19,7 +19,7 @@ def ride(seconds: float) -> tuple[DrawnRide, FloatArray]:
     return drawn, np.column_stack([drawn.speed + 0.1 * rng.normal(size=len(values)), values])
 
 
-def test_sensors_and_speed_of_a_vehicle_on_a_track_are_told_apart() -> None:
+def test_sensors_and_speed_of_a_vehicle_on_a_track_are_distinguished() -> None:
     rng = np.random.default_rng(3)
     values = np.column_stack([np.full(1000, 42.0), rng.normal(size=(1000, len(SYSTEM.sensors)))])
     signals = prepare(SYSTEM, values, 100.0).signals
@@ -30,7 +30,7 @@ def test_sensors_and_speed_of_a_vehicle_on_a_track_are_told_apart() -> None:
 
 
 @pytest.mark.slow
-def test_a_healthy_vehicle_on_an_unmeasured_track_is_consistent_and_its_values_are_told() -> None:
+def test_a_healthy_vehicle_on_an_unmeasured_track_is_consistent_and_its_values_are_reported() -> None:
     drawn, values = ride(180.0)
     report = diagnose(SYSTEM, RecordedPart(100.0, values, 0))
     assert report.verdict == "consistent" and not report.findings

@@ -117,7 +117,7 @@ def test_a_free_decay_is_known_from_vibration_that_goes_on() -> None:
     assert found is not None and abs(found.start - 200) < 5
 
 
-def test_windows_that_tell_nothing_are_refused() -> None:
+def test_uninformative_windows_are_refused() -> None:
     system = parse_system(TOWER.replace("1500", "32"))
     with pytest.raises(TooLittleError, match="no input is measured and no window"):
         diagnosed(system, tower(10, 20.0))

@@ -66,7 +66,7 @@ def test_a_motion_without_noise_is_made_no_noisier() -> None:
 @pytest.mark.parametrize(
     ("motion", "repeats"), [("sine", True), ("two amplitudes", False), ("sweep", False), ("several sines", False)]
 )
-def test_one_cycle_again_and_again_is_told_from_other_motion(motion: str, repeats: bool) -> None:
+def test_one_cycle_again_and_again_is_distinguished_from_other_motion(motion: str, repeats: bool) -> None:
     t = np.arange(4000) / 200.0
     sine = 0.01 * np.sin(2 * np.pi * 1.3 * t)
     shapes = {

@@ -184,7 +184,7 @@ def test_a_force_of_the_wrong_sign_is_a_wrong_sign_and_no_physics() -> None:
     assert found.findings[0].location == "cell"
 
 
-def test_standstill_is_cut_out_and_tells_the_noise() -> None:
+def test_standstill_is_cut_out_and_determines_the_noise() -> None:
     _, d, v = sweep(20.0)
     still = int(3 * RATE)
     d, v = np.concatenate([np.full(still, d[0]), d]), np.concatenate([np.zeros(still), v])
@@ -256,7 +256,7 @@ def test_paths_of_memories_follow_their_differential_equations() -> None:
     np.testing.assert_allclose(np.diff(stop)[inside], np.diff(d)[inside], atol=1e-12)
 
 
-def test_noise_is_told_below_the_edge_of_a_filter() -> None:
+def test_white_noise_is_estimated_below_the_cutoff_of_a_filter() -> None:
     """Resampling leaves nothing next to half the sample rate, and what is left is no smooth motion's."""
     random, (_, d, _) = np.random.default_rng(5), sweep()
     noise = 2e-5 * random.standard_normal(len(d))
@@ -347,7 +347,7 @@ def test_a_law_of_the_system_file_is_no_finding_and_what_is_beside_it_is() -> No
     assert friction.parameters[0].value == pytest.approx(60, rel=0.05)
 
 
-def test_a_force_of_no_law_is_told_as_its_formula_and_goes_into_the_system_file(tmp_path: Path) -> None:
+def test_a_force_of_no_law_is_reported_as_a_formula_and_goes_into_the_system_file(tmp_path: Path) -> None:
     _, d, v = sweep()
     found = report(K * d + C * v + 6e4 * d * np.abs(v) + 3e6 * d**2, d)
     assert found.verdict == "unknown_physics"

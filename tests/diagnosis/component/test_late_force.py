@@ -56,7 +56,7 @@ def test_a_filter_of_the_force_is_a_lag() -> None:
     assert [(f.location, f.effect) for f in found.findings if f.effect != "preload"] == [("cell", "sensor_lag")]
 
 
-def test_a_filter_of_first_order_is_told_with_its_time_constant_beside_true_values() -> None:
+def test_a_filter_of_first_order_is_reported_with_its_time_constant_beside_true_values() -> None:
     """A delay in its place would leave the stiffness and damping per cents off."""
     d, v = random_motion()
     lag = 0.004
@@ -95,7 +95,7 @@ def test_valves_behind_oil_that_gives_way_are_no_filter_of_the_cell(stiff: float
     assert "sensor_lag" not in [f.effect for f in found.findings], found.summary
 
 
-def test_in_a_sine_test_nothing_tells_a_lag() -> None:
+def test_in_a_sine_test_a_lag_is_not_identifiable() -> None:
     t = np.arange(int(20 * RATE)) / RATE
     d, late = 0.01 * np.sin(2 * np.pi * 1.3 * t), 2 * np.pi * 1.3 * (t - 0.004)
     found = report(0.01 * (K * np.sin(late) + C * 2 * np.pi * 1.3 * np.cos(late)), d)

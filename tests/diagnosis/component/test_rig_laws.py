@@ -72,7 +72,7 @@ def test_friction_that_falls_has_been_above_what_it_falls_to(smoothing: float, b
     assert piece.believed(fit) is believed
 
 
-def test_friction_whose_fall_is_not_told_is_plain_friction_where_more_than_noise_is_left() -> None:
+def test_friction_whose_fall_is_not_identifiable_is_plain_friction_where_more_than_noise_is_left() -> None:
     """A swept sine through a low pass, with hum: Stribeck's law fits a little better, with a friction of about none."""
     fine, seconds = 4000.0, 20.0
     t, random = np.arange(int(seconds * fine)) / fine, np.random.default_rng(1)
@@ -130,7 +130,7 @@ def test_what_does_not_follow_a_signal_is_not_said_to() -> None:
     assert report.findings == ()
 
 
-def test_a_signal_that_does_not_change_tells_nothing_and_is_said_so() -> None:
+def test_a_signal_that_does_not_change_is_uninformative_and_is_said_so() -> None:
     report = diagnosed(K * D + C * V + 200 * V * np.abs(V) / C, signals={"valve": np.full(len(T), 2.0)})
     assert not any("by_valve" in f.effect for f in report.findings)
 
@@ -148,7 +148,7 @@ def test_what_an_unmeasured_current_controls_is_unknown_and_predicted_no_worse_t
 
 
 @pytest.mark.parametrize(("smoothing", "told"), [(2e-3, True), (0.08, False)])
-def test_a_friction_that_turns_slowly_is_not_told_from_a_valve(smoothing: float, told: bool) -> None:
+def test_a_friction_that_turns_slowly_is_not_distinguished_from_a_valve(smoothing: float, told: bool) -> None:
     """Of a rate's deviation: a jump, which no valve imitates, and a knee that noise hides."""
     rate = smoothing * float(np.std(V))
     valve = 150 * np.clip(V / (1.5 * rate), -1, 1)

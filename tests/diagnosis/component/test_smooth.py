@@ -30,7 +30,7 @@ def stops(power: float) -> FloatArray:
         (200 * np.exp(X), "progressive_stop", 5, (0.3, 0.3, 2.0), True),
     ],
 )
-def test_stops_are_told_from_a_smooth_spring(
+def test_stops_are_distinguished_from_a_smooth_spring(
     force: FloatArray, effect: str, numbers: int, shape: tuple[float, ...], *, serves: bool
 ) -> None:
     start = (*(TRAVEL * x for x in shape[:2]), *shape[2:])

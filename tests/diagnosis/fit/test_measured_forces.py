@@ -85,7 +85,7 @@ def test_friction_and_offset_come_back_within_their_uncertainty_in_closed_loop(
     assert np.abs((np.array(values) - truth) / deviations).max() < 4
 
 
-def test_noise_of_a_force_is_told_by_the_residual(fitted: tuple[System, Problem, Fit]) -> None:
+def test_noise_of_a_force_is_estimated_from_the_residual(fitted: tuple[System, Problem, Fit]) -> None:
     _, problem, fit = fitted
     assert FORCE_NOISE / 2 < problem.noise.force[0] < 2 * FORCE_NOISE
     assert fit.reduced == pytest.approx(1.0, abs=0.4)

@@ -7,7 +7,7 @@ from sprung.model.diagnosis.fit.noise import input_noise
 from tests.diagnosis_cases import problem_of, simulate
 
 
-def test_input_noise_is_told_by_the_second_measurement() -> None:
+def test_input_noise_is_estimated_from_the_second_measurement() -> None:
     record = simulate(seed=4)
     rng = np.random.default_rng(5)
     record.values[:, 1] += 1e-3 * rng.standard_normal(len(record.values))

@@ -74,7 +74,7 @@ def test_a_fit_of_a_formula_begins_where_everything_has_moved_along(unnamed: tup
 
 
 @pytest.mark.slow
-def test_a_sum_is_told_with_its_force_and_its_half_is_doubted(unnamed: tuple[Investigation, Trial]) -> None:
+def test_a_sum_is_reported_with_its_force_and_its_half_is_doubted(unnamed: tuple[Investigation, Trial]) -> None:
     state, trial = unnamed
     told, reason = formula_of(state.problem, state.fit, trial, state.held)
     assert told is not None and reason == ""

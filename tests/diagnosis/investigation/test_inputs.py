@@ -88,7 +88,7 @@ def _measured_by(
         (("displacement", "acceleration"), "", ""),
     ],
 )
-def test_a_wrong_channel_is_told_from_those_beside_it(quantities: tuple[str, ...], faulty: str, effect: str) -> None:
+def test_a_wrong_channel_is_distinguished_from_others(quantities: tuple[str, ...], faulty: str, effect: str) -> None:
     name, value = FAULTS.get(effect, ("", 0.0))
     response = SensorResponse(**{name: value}) if effect else None
     system, values, rate = _measured_by(quantities, faulty, response)

@@ -16,7 +16,7 @@ from sprung.model.diagnosis.rules import RULES
     ("left", "error", "rejected"),
     [(0.9, 0.8, True), (0.3, 0.8, False), (0.9, 0.3, False)],  # of chi-square; of the sensors
 )
-def test_a_finding_that_hardly_helps_a_strange_model_is_the_last(
+def test_a_finding_that_hardly_helps_a_rejected_model_is_the_last(
     left: float, error: float, rejected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(diagnose, "misfit", lambda fit: np.full(3, error**2))

@@ -32,7 +32,7 @@ def test_a_search_at_its_limit_of_time_reports_what_was_found_until_then() -> No
     assert "ended at its limit of time" in report.summary and "ended at its limit of time" in report.advice[0]
 
 
-def test_the_end_of_a_budget_that_was_not_needed_is_not_told() -> None:
+def test_the_end_of_a_budget_that_was_not_needed_is_not_reported() -> None:
     work = WorkBudget(1e9, time.monotonic() + 1000)
     told = diagnose(quarter_car(), simulate(seconds=6, seed=4), Options(work=work))
     assert told.verdict == "consistent" and "ended" not in told.summary

@@ -43,7 +43,7 @@ def test_an_acceleration_alone_is_enough_where_one_support_carries_everything() 
     assert np.std(curvature - (values[1:-1, 0] - values[:, 0].mean())) < 0.05 * np.std(values[:, 0])
 
 
-def test_accelerations_alone_tell_the_values_of_a_whole_recording_in_which_not_everything_wanders_alike() -> None:
+def test_accelerations_alone_identify_a_whole_recording_in_which_not_everything_drifts_alike() -> None:
     system, runs = ride(A, 12_000, ABSOLUTE)
     signals = prepare(system, runs.values[0], 200.0).signals
     assert np.std(signals.displacement) < 2 * np.std(runs.clean[0, :, 0])  # the integral does not wander

@@ -15,7 +15,7 @@ ROAD = "displacement: {csv: z, noise: 1e-5}, velocity: {csv: vz, noise: 1e-3}"
 
 
 @pytest.mark.parametrize(("quantity", "order"), [("displacement", 0), ("acceleration", 2)])
-def test_the_rate_of_a_support_that_nobody_measured_is_right_up_to_the_ends(quantity: str, order: int) -> None:
+def test_the_unmeasured_rate_of_a_support_is_right_up_to_the_ends(quantity: str, order: int) -> None:
     system = parse_system(QUARTER_CAR.replace(ROAD, f"{quantity}: {{csv: z, noise: 1e-5}}"))
     time, omega = np.arange(2000) / system.sample_rate, 2 * np.pi * np.array([1.03, 3.71])
     motion, rate = (((1j * omega) ** k * np.exp(1j * np.outer(time, omega))).imag.sum(axis=1) for k in (order, 1))

@@ -17,7 +17,7 @@ def trial(law: Any, evidence: float, location: str = "strut") -> Any:
     )
 
 
-def test_a_name_that_says_less_than_an_implausible_one_is_not_told_alone() -> None:
+def test_a_name_of_less_evidence_than_an_implausible_one_is_not_reported_alone() -> None:
     chosen = trial(COULOMB_FRICTION, 100.0)
     better, elsewhere = trial(DAMPER_BLOWOFF, 103.0), trial(DAMPER_BLOWOFF, 120.0, "tyre")
     for other, family in ((better, "coulomb_friction or damper_blowoff"), (elsewhere, None)):
@@ -26,7 +26,7 @@ def test_a_name_that_says_less_than_an_implausible_one_is_not_told_alone() -> No
     assert _look_alikes(near, RULES.report)[0] == "coulomb_friction or damper_blowoff"
 
 
-def test_other_places_at_which_the_same_law_does_as_well_are_told() -> None:
+def test_other_places_at_which_the_same_law_does_as_well_are_reported() -> None:
     chosen = trial(COULOMB_FRICTION, 100.0)
     rivals = (trial(COULOMB_FRICTION, 99.0, "tyre"), trial(COULOMB_FRICTION, 60.0, "bush"))
     assert _elsewhere(Found(chosen, (chosen, *rivals), None, 1e-9), RULES.report) == ("tyre",)

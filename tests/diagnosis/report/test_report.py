@@ -46,12 +46,12 @@ def test_a_finding_says_only_what_is_known_of_it() -> None:
     assert told["parameters"] == [{"name": "force", "value": 395.0, "std": 6.0, "unit": "N"}]
 
 
-def test_a_variant_is_told_where_there_is_one() -> None:
+def test_a_variant_is_reported_where_there_is_one() -> None:
     assert "variant" not in IdentifiedLaw("k1", "bump_stop", ()).to_dict()
     assert IdentifiedLaw("car", "flexible_mode", (), "bending").to_dict()["variant"] == "bending"
 
 
-def test_a_number_whose_deviation_exceeds_it_is_told_as_not_determined() -> None:
+def test_a_number_whose_deviation_exceeds_it_is_reported_as_not_determined() -> None:
     beta = LawParameter("beta", 3.5e13, 6.3e14, "m^-n")
     assert not beta.determined
     assert beta.words() == "not determined"

@@ -15,7 +15,7 @@ from tests.diagnosis_cases import quarter_car
 
 
 @pytest.mark.parametrize(("law", "unit"), [("sensor_bias", "m/s^2"), ("sensor_gain", "1"), ("sensor_lag", "s")])
-def test_an_offset_is_told_in_the_unit_of_its_channel(law: str, unit: str) -> None:
+def test_an_offset_is_reported_in_the_unit_of_its_channel(law: str, unit: str) -> None:
     term = Term(find_law(law), "car_a", (0.9,))
     fit: Any = SimpleNamespace(
         point=SimpleNamespace(terms=(term,)),
@@ -42,7 +42,7 @@ def test_a_size_in_the_unit_of_a_power_is_as_uncertain_as_the_power() -> None:
     assert values["beta"].std == pytest.approx(2.0e4 * np.log(1 / 0.005) * 2e-3, rel=0.05)
 
 
-def test_what_branches_stand_for_is_told_as_accurately_as_they_follow_it() -> None:
+def test_what_branches_stand_for_is_reported_as_accurately_as_they_follow_it() -> None:
     term = Term(find_law("structural_damping"), "primary|secondary", (0.04, 0.0), scales=(0.02, 0.1))
     fit: Any = SimpleNamespace(
         point=SimpleNamespace(terms=(term,)),

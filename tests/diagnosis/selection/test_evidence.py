@@ -72,7 +72,7 @@ def test_a_sharper_noise_level_and_its_determinant_count_together() -> None:
     assert lost == pytest.approx(2 * 40 * np.log(9), rel=0.2)
 
 
-def test_a_parameter_costs_what_the_recording_tells_about_it() -> None:
+def test_a_parameter_costs_its_information_in_the_recording() -> None:
     assert occam_cost([True], [1.0], np.array([[100.0]])) == pytest.approx(0.0, abs=0.1)
     costs = [occam_cost([False], [2.0], np.array([[sigma**2]])) for sigma in (1e-3, 1e-2)]
     assert costs[0] - costs[1] == pytest.approx(2 * np.log(10), rel=1e-3)
@@ -82,7 +82,7 @@ def test_a_parameter_costs_what_the_recording_tells_about_it() -> None:
 
 
 @pytest.mark.parametrize("unknown", [10.0, 1e4])
-def test_two_numbers_of_which_a_product_alone_is_told_cost_as_much_as_one(unknown: float) -> None:
+def test_two_numbers_of_which_only_the_product_is_identifiable_cost_as_much_as_one(unknown: float) -> None:
     """Stiffness and yield displacement of a friction that hardly gives way: their product is its force."""
     told, either = np.array([1.0, 1.0]) / np.sqrt(2), np.array([1.0, -1.0]) / np.sqrt(2)
     covariance = 0.01**2 * np.outer(told, told) + unknown**2 * np.outer(either, either)

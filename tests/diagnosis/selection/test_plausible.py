@@ -85,7 +85,7 @@ def test_a_resonance_above_what_is_compared_is_no_resonance(law: str) -> None:
         ("mass_change", (2.7,), False),
     ],
 )
-def test_gains_and_masses_that_stand_for_something_else_are_not_believed(
+def test_gains_and_masses_that_stand_for_something_else_are_not_accepted(
     law: str, values: tuple[float, ...], believed: bool
 ) -> None:
     reason = out_of_range(Term(find_law(law), "x", values))
@@ -116,7 +116,7 @@ def test_what_is_as_if_it_were_not_there_is_no_finding(
 
 
 @pytest.mark.parametrize(("knee", "believed"), [(0.2, True), (0.004, False)])
-def test_a_knee_within_one_sample_is_not_believed(knee: float, believed: bool) -> None:
+def test_a_knee_within_one_sample_is_not_accepted(knee: float, believed: bool) -> None:
     rate = np.repeat(0.5 * sine(2.0), 4)  # passes 0.06 m/s within a sample at its reversals
     term = Term(find_law("damper_blowoff"), "strut", (knee, 0.2))
     part = SimpleNamespace(grid=GRID)

@@ -163,7 +163,7 @@ def test_scopes_of_one_fleet_never_count_for_another(provider: FakeProvider, tmp
     assert (set(actor.scopes), actor.fleet) == ({"read", "operate"}, "north-")
 
 
-def test_a_provider_that_is_away_is_told_and_nobody_gets_in(client: TestClient, provider: FakeProvider) -> None:
+def test_a_provider_that_is_away_is_reported_and_nobody_gets_in(client: TestClient, provider: FakeProvider) -> None:
     provider.broken = True
     answer = client.get("/signin/oidc")
     assert answer.status_code == 503 and "cannot be reached" in answer.text
@@ -196,7 +196,7 @@ def test_a_provider_that_is_back_is_asked_again(
         {"oidc_groups": {"a": ["read", "fleet:a", "fleet:b"]}},
     ],
 )
-def test_settings_that_cannot_work_are_told_at_start(
+def test_settings_that_cannot_work_are_reported_at_start(
     provider: FakeProvider, tmp_path: Path, wrong: dict[str, Any]
 ) -> None:
     given = provider_settings(provider, tmp_path).model_dump() | {"oidc_client_secret": None} | wrong

@@ -78,7 +78,7 @@ def client(warm: System, tmp_path: Path) -> Iterator[TestClient]:
         yield running_client
 
 
-def test_the_temperature_of_a_ride_is_told(client: TestClient) -> None:
+def test_the_temperature_of_a_ride_is_reported(client: TestClient) -> None:
     found = client.get("/vehicles/a/circumstances").json()
     assert found["resolution"] == 60
     told = found["series"]["temperature"]
@@ -95,7 +95,7 @@ def test_what_a_body_carries_stands_beside_what_was_measured(warm: System) -> No
 
 
 @pytest.mark.parametrize("declared", [True, False])
-def test_windows_tell_the_load_as_a_parameter_where_the_system_file_names_it(declared: bool) -> None:
+def test_the_load_is_a_parameter_of_windows_where_the_system_file_names_it(declared: bool) -> None:
     text = MANCHESTER.read_text()
     empty = "position: [0.0, 0.0]}"
     system = parse_system(text.replace(empty, "position: [0.0, 0.0], load: true}", 1) if declared else text)

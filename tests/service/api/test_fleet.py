@@ -158,7 +158,7 @@ def test_dropped_windows_have_a_reason_in_api_and_metrics(client: TestClient, co
     assert 'sprung_windows_dropped_total{reason="gap",vehicle="a"} 3.0' in client.get("/metrics").text
 
 
-def test_what_does_not_fit_is_told_and_its_prior_is_no_history(
+def test_what_does_not_fit_is_reported_and_its_prior_is_no_history(
     client: TestClient, core: Core, system: System, identifier: FakeIdentifier
 ) -> None:
     identifier.chi_square = 5.0

@@ -90,7 +90,7 @@ def test_a_body_that_stops_coming_is_given_up(engine: Engine, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("trusted", [False, True])
-def test_what_a_proxy_says_is_believed_of_trusted_ones_only(engine: Engine, tmp_path: Path, trusted: bool) -> None:
+def test_what_a_proxy_says_is_accepted_of_trusted_ones_only(engine: Engine, tmp_path: Path, trusted: bool) -> None:
     proxies = ("127.0.0.0/8",) if trusted else ()
     core = build_core(settings(tmp_path, client_requests_per_second=0.1, trusted_proxies=proxies), engine)
     with served(core) as port:
@@ -196,7 +196,7 @@ def test_a_start_that_only_python_would_take_for_a_number_is_none(client: TestCl
 
 
 @pytest.mark.parametrize("boundary", ["b" * 71, "b" * 5000, "\xff"])
-def test_a_boundary_that_is_none_is_told(client: TestClient, boundary: str) -> None:
+def test_a_boundary_that_is_none_is_reported(client: TestClient, boundary: str) -> None:
     content_type = f"multipart/form-data; boundary={boundary}".encode("latin-1")
     assert client.post("/recordings", content=b"x", headers={b"content-type": content_type}).status_code == 422
 

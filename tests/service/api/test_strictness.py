@@ -49,7 +49,7 @@ def test_a_wrong_query_is_refused(client: TestClient, path: str, field: str) -> 
 
 
 @pytest.mark.parametrize(("body", "said"), [(b'{"text":', "is no JSON"), (b"[]", "object"), (b"3", "object")])
-def test_a_body_that_is_none_is_told_as_the_body(client: TestClient, body: bytes, said: str) -> None:
+def test_a_body_that_is_none_is_reported_as_the_body(client: TestClient, body: bytes, said: str) -> None:
     answer = client.post("/vehicles/a/notes", content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 422
     (error,) = answer.json()["errors"]

@@ -44,7 +44,7 @@ def test_a_closed_alarm_accuses_nobody() -> None:
     assert all(mark.state == "ok" for mark in sensor_marks(SYSTEM, closed).values())
 
 
-def test_what_an_alarm_cannot_be_told_from_is_said() -> None:
+def test_what_an_alarm_cannot_be_distinguished_from_is_reported() -> None:
     view = replace(VIEW, alarms=(DAMPER,))
     rivals = DAMPER.alternatives
     active = [AlarmRow("change", DAMPER.parameter, 0, 1, None, "warning", -0.1, 0.02, None, alternatives=rivals)]
@@ -62,7 +62,7 @@ def test_what_is_wrong_with_a_sensor_is_said_with_its_size_and_since_when() -> N
     assert said[0].text.startswith("Since 1970-01-01 00:00:01 UTC: bogie1_1l, gain +5.9 ± 0.3 %. Check mounting")
 
 
-def test_a_body_that_is_not_as_its_file_says_is_told() -> None:
+def test_a_body_that_is_not_as_its_file_says_is_reported() -> None:
     view = replace(VIEW, alarms=(), built=(BuiltOtherwise("bogie1", "mass", 0.024, 0.006),))
     (said,) = hints(ROW, view, [], [], False, sensor_marks(SYSTEM, view))
     assert said.level == "info"

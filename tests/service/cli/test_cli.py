@@ -359,7 +359,7 @@ def test_train_takes_several_recordings_and_tells_how_far_it_is(
     assert all(cost > 0 for pair in told["saved"].values() for cost in pair)
 
 
-def test_system_tells_what_the_sensors_identify(capsys: pytest.CaptureFixture[str]) -> None:
+def test_system_shows_what_the_sensors_identify(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["system", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert len(told["parameters"]) == 24 and all(p["identifiable"] for p in told["parameters"])

@@ -66,7 +66,7 @@ LONG = {
 
 
 @pytest.mark.parametrize(("command", "option"), [(c, option) for c, options in LONG.items() for option in options])
-def test_what_cannot_be_written_is_told_before_the_work(
+def test_what_cannot_be_written_is_reported_before_the_work(
     command: str, option: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     target = "/proc/nowhere/x.csv" if option == "--folder" else "/proc/x.csv"
@@ -218,7 +218,7 @@ def test_what_a_recording_lost_is_counted_in_words() -> None:
     )
 
 
-def test_an_empty_standard_input_is_told_by_every_command_that_takes_one(
+def test_an_empty_standard_input_is_reported_by_every_command_that_takes_one(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for command in ("replay", "diagnose"):

@@ -11,7 +11,7 @@ def test_the_size_of_a_change_is_said_in_its_own_unit() -> None:
     assert size_in_words(None, None) == ""
 
 
-def test_wrong_sensors_and_loads_are_told_below_the_table() -> None:
+def test_wrong_sensors_and_loads_are_reported_below_the_table() -> None:
     found = {
         "sensors": [
             {"channel": "bogie1_1l", "kind": "gain", "value": 1.0507, "std": 0.0034},

@@ -92,7 +92,7 @@ def test_what_the_file_holds_fixed_stays_fixed() -> None:
     assert law.fixed == (True, True)
 
 
-def test_what_no_file_can_hold_is_told() -> None:
+def test_what_no_file_can_hold_is_reported() -> None:
     friction = IdentifiedLaw("strut", "coulomb_friction", (LawParameter("force", 41.0, 0.5, "N"),))
     named = Finding("strut", "coulomb_friction", EffectKind.LISTED, (), 1e-9, -50.0)
     late = Finding("wheel_a|car_a", "node_delay", EffectKind.FAULT, (), None, None)
@@ -100,7 +100,7 @@ def test_what_no_file_can_hold_is_told() -> None:
     assert left_out(report((friction,), (named, late, noisy))) == ["node delay at wheel_a and car_a"]
 
 
-def test_files_that_cannot_be_written_are_told_before_the_work(
+def test_files_that_cannot_be_written_are_reported_before_the_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "page").write_text("a file")

@@ -177,7 +177,7 @@ def test_a_vehicle_of_which_work_was_lost_stays_as_it_was_until_the_next_time(
         assert [row.id for row in status.fleet_page(connection, status.Wanted(), "id", 10)] == ["north-1"]
 
 
-def test_a_copy_of_a_recording_adds_nothing_and_is_told(plan: BackfillPlan, place: Path, any_store: Store) -> None:
+def test_a_copy_of_a_recording_adds_nothing_and_is_reported(plan: BackfillPlan, place: Path, any_store: Store) -> None:
     (place / "copy.mcap").write_bytes((place / "north" / "a-north-1.mcap").read_bytes())
     done: dict[str, FoldedFile] = {}
     backfill(plan, HereTasks(), 2, lambda file, *_: done.update({Path(file.file.path).name: file}))
@@ -190,7 +190,7 @@ def test_a_copy_of_a_recording_adds_nothing_and_is_told(plan: BackfillPlan, plac
     assert sum(count for outcome, count in line.windows.items() if outcome != "unfitting") == rows
 
 
-def test_a_recording_that_breaks_a_reader_is_told_of_and_the_others_go_on(
+def test_a_recording_that_breaks_a_reader_is_reported_of_and_the_others_go_on(
     plan: BackfillPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def breaking(request: ReadRequest, limits: ProcessLimits | None) -> object:

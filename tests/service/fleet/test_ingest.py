@@ -114,7 +114,7 @@ def test_many_vehicles_are_folded_with_the_statements_of_one(
     assert lines.keys() == set(names) and all(sum(counted.values()) >= 24 for counted in lines.values())
 
 
-def test_what_is_told_of_a_message(engine: Engine, system: System, pipeline: Pipeline) -> None:
+def test_what_is_reported_of_a_message(engine: Engine, system: System, pipeline: Pipeline) -> None:
     ingest = Ingest(pipeline, LATE, Clock())
     first, second, third = messages(engine, system, 60, 20)
     told = ingest.take([first])[0]

@@ -1,4 +1,4 @@
-"""What the fleet tells, as programs and people get it: the route, the fleet page, and who may see whose."""
+"""Trends of the fleet, as programs and people get it: the route, the fleet page, and who may see whose."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ def test_the_route_tells_the_fastest_the_worst_and_what_all_did(client: TestClie
 
 def test_the_page_shows_them(client: TestClient, worn: str) -> None:
     page = client.get("/").text
-    assert "What the fleet tells" in page and "Furthest from its class" in page
-    told = page[page.index("What the fleet tells") :]
+    assert "Trends of the fleet" in page and "Furthest from its class" in page
+    told = page[page.index("Trends of the fleet") :]
     for name in (WORN, DEPARTED):
         assert f'href="/pages/vehicles/{name}"' in told
     assert worn in told and "Left out of the trends" in told
@@ -98,10 +98,10 @@ def test_a_token_of_one_fleet_sees_that_fleet_alone(client: TestClient, worn: st
     assert all(one["vehicle"].startswith("south-") for one in told["fastest"] + told["worst"])
 
 
-def test_an_empty_fleet_tells_nothing(client: TestClient) -> None:
+def test_an_empty_fleet_is_uninformative(client: TestClient) -> None:
     told = client.get("/fleet/knowledge").json()
     assert (told["parameters"], told["fastest"], told["worst"], told["usual"]) == (0, [], [], [])
-    assert "What the fleet tells" not in client.get("/").text
+    assert "Trends of the fleet" not in client.get("/").text
 
 
 @pytest.mark.parametrize("query", ["days=2", "days=x", "limit=0", "limit=1000"])

@@ -46,7 +46,7 @@ def told(place: Path, out: Path) -> list[DiagnosedFile]:
     return [one for one, _ in found]
 
 
-def test_what_fails_is_told_and_the_others_go_on(place: Path, diagnosed: list[str], tmp_path: Path) -> None:
+def test_what_fails_is_reported_and_the_others_go_on(place: Path, diagnosed: list[str], tmp_path: Path) -> None:
     a, b, c = told(place, tmp_path / "out")
     assert (a.verdict, a.findings, a.problem) == ("mismatch", ("A friction.",), "")
     assert (b.verdict, b.problem) == ("", "unexpected RuntimeError: nobody has thought of it")
@@ -67,7 +67,7 @@ def test_started_again_it_does_what_is_left_and_what_has_changed(
     assert diagnosed == ["a.csv", "b.csv", "c.csv"]
 
 
-def test_each_is_told_before_the_next_is_begun(place: Path, diagnosed: list[str], tmp_path: Path) -> None:
+def test_each_is_reported_before_the_next_is_begun(place: Path, diagnosed: list[str], tmp_path: Path) -> None:
     found = diagnose_many(Settings(), str(place), tmp_path / "out", HereTasks(), 2)
     next(found)
     assert diagnosed == ["a.csv"]

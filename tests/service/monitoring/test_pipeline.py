@@ -95,7 +95,7 @@ def test_lasting_faults_of_a_vehicle_are_told_to_those_who_examine_its_windows(
     assert examiner.told == [()] * 9 + [examiner.faults]
 
 
-def test_dropped_windows_are_counted_and_tell_nothing(
+def test_dropped_windows_are_counted_and_are_uninformative(
     pipeline: Pipeline, store: Store, system: System, identifier: FakeIdentifier
 ) -> None:
     batch = pipeline.process("a", [make_window(system, 0), make_window(system, 1, outcome="dropped")])

@@ -23,7 +23,7 @@ from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.errors import UserError
 from sprung.service.monitoring.engine import Engine
-from sprung.service.monitoring.views import spoken, told
+from sprung.service.monitoring.views import changed_part, spoken
 from sprung.service.notify.events import alarm_event, sentence
 from sprung.service.notify.notices import PAUSES, Notices
 from sprung.service.notify.senders import signature
@@ -89,7 +89,7 @@ def alarm(core: Core, system: System) -> None:
     core.pipeline.process("a", [make_window(system, 80 + i, 0.3) for i in range(60)])
 
 
-def test_alarms_are_told_as_signed_cloud_events(core: Core, system: System, received: Received) -> None:
+def test_alarms_are_reported_as_signed_cloud_events(core: Core, system: System, received: Received) -> None:
     alarm(core, system)
     assert core.notices.deliver(now_ns()) > 0
     headers, body = received.requests[0]
@@ -111,7 +111,7 @@ def test_alarms_are_told_as_signed_cloud_events(core: Core, system: System, rece
     }
 
 
-def test_a_change_of_severity_is_told(core: Core, system: System, received: Received) -> None:
+def test_a_change_of_severity_is_reported(core: Core, system: System, received: Received) -> None:
     core.pipeline.process("a", [make_window(system, i) for i in range(80)])
     core.pipeline.process("a", [make_window(system, 80 + i, 0.12) for i in range(60)])
     core.pipeline.process("a", [make_window(system, 140 + i, 0.4) for i in range(200)])
@@ -186,7 +186,7 @@ def test_mail_goes_through_smtp(tmp_path: Path, store: Store) -> None:
     assert "dry friction at secondary_2r" in got[0] and "To: depot@example.org" in got[0]
 
 
-def test_a_lost_bus_is_told_once_and_told_when_it_is_back(tmp_path: Path, store: Store) -> None:
+def test_a_lost_bus_is_reported_once_and_told_when_it_is_back(tmp_path: Path, store: Store) -> None:
     @dataclass
     class Feed:
         name: str = "socketcan:can0"
@@ -217,18 +217,18 @@ def test_without_a_secret_nothing_is_signed() -> None:
     assert "webhook-signature" not in signature("i", 1, b"{}", None)
 
 
-def test_alarms_of_all_elements_are_told_in_words() -> None:
+def test_alarms_of_all_elements_are_reported_in_words() -> None:
     assert spoken("*.damping") == "damping of all elements"
     assert spoken("primary_*.stiffness") == "stiffness of all primary elements"
     assert spoken("secondary_2l.damping") == "secondary_2l.damping"
 
 
-def test_a_change_that_may_be_a_sensor_s_is_told_with_the_sensor_first() -> None:
+def test_a_change_that_may_be_a_sensor_s_is_reported_with_the_sensor_first() -> None:
     alarm = Alarm(
         "change", "primary_11l.damping", 1, 2, "warning", -0.153, 0.012, -0.153, alternatives=("bogie1_1l.gain",)
     )
     event = alarm_event("", "car-17", AlarmChange("opened", alarm, None), now_ns())
     assert sentence(event) == "car-17: warning opened: bogie1_1l.gain or primary_11l.damping -15.3 %"
     assert event["data"]["advisory"].startswith("The measurements do not tell it from bogie1_1l.gain: check the sensor")
-    assert told(alarm) == "bogie1_1l.gain or primary_11l.damping"
-    assert told(replace(alarm, alternatives=())) == "primary_11l.damping"
+    assert changed_part(alarm) == "bogie1_1l.gain or primary_11l.damping"
+    assert changed_part(replace(alarm, alternatives=())) == "primary_11l.damping"

@@ -82,7 +82,7 @@ def test_a_page_of_alarms_behind_the_last_leads_back(client: TestClient, alarmed
         assert client.get(f"/pages/alarms?{wrong}").status_code == 422
 
 
-def test_what_an_alarm_is_not_told_from_stays_beside_it(client: TestClient, core: Core) -> None:
+def test_what_an_alarm_is_not_distinguished_from_stays_beside_it(client: TestClient, core: Core) -> None:
     rivals = ("bogie1_1l.gain", "bogie1_1l.delay")
     with core.store.write() as connection:
         fleet.ensure_vehicle(connection, "a", 1)

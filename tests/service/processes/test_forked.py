@@ -113,7 +113,7 @@ def test_a_process_that_is_killed_between_parts(doubling: ForkedFunctions) -> No
             list(each)
 
 
-def test_a_process_that_was_killed_is_told_once(doubling: ForkedFunctions, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_killed_process_is_reported_once(doubling: ForkedFunctions, caplog: pytest.LogCaptureFixture) -> None:
     assert doubling.pid is not None
     os.kill(doubling.pid, signal.SIGKILL)
     for _ in range(2):

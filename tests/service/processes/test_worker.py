@@ -53,7 +53,7 @@ def test_messages_arrive_in_order_and_then_the_result() -> None:
         ("leave", UserError, r"the process of the work ended without an answer \(status 7\)"),
     ],
 )
-def test_every_end_is_told_for_what_it_was(how: str, error: type[Exception], told: str) -> None:
+def test_every_end_is_reported_for_what_it_was(how: str, error: type[Exception], told: str) -> None:
     worker: Worker[int, str] = Worker(misbehave, how, EASY, "the work")
     with pytest.raises(error, match=told):
         list(worker.messages())

@@ -362,7 +362,7 @@ def test_housekeeping_deletes_what_is_old(core: Core, recording: Path) -> None:
     core.close()
 
 
-def test_no_recent_samples_is_told(core: Core) -> None:
+def test_no_recent_samples_is_reported(core: Core) -> None:
     with pytest.raises(UserError, match="no recent samples"):
         core.diagnoses.from_excerpt("nobody")
     core.close()

@@ -53,7 +53,7 @@ def test_the_history_goes_on_into_the_archive(any_store: Store, tmp_path: Path) 
     assert raw(any_store, archive, model, since=START + 90 * HOP) == before.time.tolist()[90:]
 
 
-def test_windows_that_are_archived_twice_are_told_once(store: Store, tmp_path: Path) -> None:
+def test_windows_that_are_archived_twice_are_reported_once(store: Store, tmp_path: Path) -> None:
     """The process died after it had written the files and before it had deleted the windows."""
     archive = Archive(str(tmp_path / "archive"))
     model = fill(store, [record(i) for i in range(10)])

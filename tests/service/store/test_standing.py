@@ -29,7 +29,7 @@ def times(client: TestClient, resolution: float) -> tuple[list[int], list[int]]:
 
 
 @pytest.mark.parametrize("resolution", [0, 10, 60, 300, 3600])
-def test_points_without_a_window_that_told_anything(client: TestClient, stood: str, resolution: int) -> None:
+def test_points_without_a_window_that_was_informative(client: TestClient, stood: str, resolution: int) -> None:
     every, still = times(client, resolution)
     width = resolution * 1000
     moved = {(START + i * HOP) // 10**6 for i in RAN}
@@ -46,7 +46,7 @@ def test_since_and_until_bound_them(client: TestClient, stood: str) -> None:
     assert client.get("/pages/vehicles/b/standing").status_code == 404
 
 
-def test_the_fit_that_is_shown_is_of_a_window_that_told_something(client: TestClient, stood: str) -> None:
+def test_the_fit_that_is_shown_is_of_a_window_that_was_informative(client: TestClient, stood: str) -> None:
     assert ">0.030<" in client.get("/").text and "0.490" not in client.get("/").text
     page = client.get("/pages/vehicles/a").text
     assert "standing: the newest window tells nothing; when it last ran, fit NRMSE 0.030" in page

@@ -184,7 +184,7 @@ def test_history_bounds_range_and_number_and_keeps_the_newest(any_store: Store) 
     assert (np.diff(coarse.time) == 5 * NANOSECONDS).all()
 
 
-def test_hours_are_told_from_hourly_rollups(any_store: Store) -> None:
+def test_hours_are_distinguished_from_hourly_rollups(any_store: Store) -> None:
     hours = [record(i * 7200) for i in range(48)]  # one window an hour, for two days
     model = fill(any_store, hours)
     with any_store.read() as connection:
@@ -261,7 +261,7 @@ def test_a_store_of_the_version_before_keeps_its_windows(any_store: Store) -> No
     assert seen is not None and seen.std[0] == 0.01
 
 
-def test_what_an_alarm_is_not_told_from_is_kept_with_it(any_store: Store) -> None:
+def test_what_an_alarm_is_not_distinguished_from_is_kept_with_it(any_store: Store) -> None:
     """Also while it is closed, and in a list after the tracker has forgotten it; alarms of an older store have none."""
     alarm = Alarm("change", "primary_11l.damping", 0, 1, "warning", -0.1, 0.02, alternatives=("bogie1_1l.gain",))
     model = fill(any_store, [])

@@ -22,7 +22,7 @@ MOST_POINTS = 60  # of a vehicle
 DAY = 86_400 * NANOSECONDS
 
 
-class FleetTelling:
+class FleetStatistics:
     """Safe to share between threads."""
 
     def __init__(self, engine: Engine, store: Store, model_id: int) -> None:
@@ -32,16 +32,16 @@ class FleetTelling:
         self._lock = threading.Lock()
         self._held: dict[tuple[str, int], tuple[float, FleetKnowledge]] = {}
 
-    def told(self, prefix: str = "", days: int = DAYS) -> FleetKnowledge:
+    def known(self, prefix: str = "", days: int = DAYS) -> FleetKnowledge:
         """As of the last ten minutes, from roll-ups of the last `days`; of vehicles whose ids begin with `prefix`."""
         with self._lock:
             now = time.monotonic()
             self._held = {key: held for key, held in self._held.items() if now - held[0] < FRESH_SECONDS}
             if (prefix, days) not in self._held:
-                self._held[prefix, days] = (now, self._tell(prefix, days))
+                self._held[prefix, days] = (now, self._computed(prefix, days))
             return self._held[prefix, days][1]
 
-    def _tell(self, prefix: str, days: int) -> FleetKnowledge:
+    def _computed(self, prefix: str, days: int) -> FleetKnowledge:
         now, tracker = now_ns(), self._engine.tracker
         with self._store.read() as connection:
             found = fleet_levels(connection, self._model_id, now - days * DAY, now, min(days, MOST_POINTS), prefix)
