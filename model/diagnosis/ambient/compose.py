@@ -183,8 +183,6 @@ def _advice(
         words.append("too few windows to reveal a wrong structure: record longer")
     pairs = zip(system.parameters, pooled.deviation, strict=True)
     undetermined = [parameter.name for parameter, std in pairs if std > rules.undetermined]
-        p.name for p, std in zip(system.parameters, pooled.deviation, strict=True) if std > rules.undetermined
-    ]
     if undetermined:
         words.append(f"undecided without measured inputs: {', '.join(undetermined)}; longer windows determine more")
     return words
