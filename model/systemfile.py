@@ -124,8 +124,7 @@ def parse_system_file(text: str, source: str = "system file") -> SystemFile:
         finally:
             loader.dispose()
     except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
-        problem = " ".join(str(error).split())
-        raise SystemFileError(f"{source}: not YAML: {problem[:200]}") from None
+        raise SystemFileError(f"{source}: {_syntax(error)}") from None
     if not isinstance(raw, Mapping):
         raise SystemFileError(f"{source}: a mapping with name, bodies, elements, sensors is expected")
     problems, file = loader.problems + _hidden(node), None
@@ -137,6 +136,15 @@ def parse_system_file(text: str, source: str = "system file") -> SystemFile:
     if problems or file is None:
         raise _error(source, problems)
     return file
+
+
+def _syntax(error: Exception) -> str:
+    """Where a text is not YAML, and why."""
+    if not isinstance(error, yaml.MarkedYAMLError) or error.problem_mark is None:
+        return f"not YAML: {' '.join(str(error).split())[:200]}"
+    problem = " ".join(part for part in (error.context, error.problem) if part)
+    hint = "; indent with spaces, not with tabs" if "'\\t'" in problem else ""
+    return f"line {error.problem_mark.line + 1}: not YAML: {' '.join(problem.split())[:200]}{hint}"
 
 
 def _hidden(document: yaml.Node | None) -> list[tuple[int, str]]:

@@ -60,8 +60,8 @@ def read_layout(path: Path) -> tuple[TableLayout, Head]:
     head = Head(path)
     layout = sniff(head.lines)
     if layout is None:
-        begins = " ".join(head.lines[0].split())[:60] if head.lines else "nothing"
-        raise UnreadableRecording(f"{path}: no rows of numbers in its first lines; it begins with {begins!r}")
+        begins = f"begins with {' '.join(head.lines[0].split())[:60]!r}" if head.lines else "is empty"
+        raise UnreadableRecording(f"{path}: no rows of numbers in its first lines; it {begins}")
     return layout, head
 
 

@@ -126,7 +126,9 @@ def _wanted_columns(
         named = [(place, channel.name) for place, channel in enumerate(channels) if channel.name in names]
     if not named:
         key = "`csv: name`" if csv else "`column: name`"
-        raise UnreadableRecording(f"{path}: the system file names no columns; give its channels {key} to read tables")
+        raise UnreadableRecording(
+            f"{path}: the system file names no columns; give its channels {key}, or name another system file (--system)"
+        )
     return named
 
 

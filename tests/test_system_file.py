@@ -314,3 +314,16 @@ def test_yaml_that_costs_or_breaks_is_refused_in_one_line_at_once(
         parse_system_file(text)
     assert "\n" not in str(caught.value)
     assert time.process_time() - began < 2
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("\tcar: {mass: 1}", "line 3: not YAML: .*; indent with spaces, not with tabs$"),
+        ("  a: b: c", "line 3: not YAML: mapping values are not allowed here$"),
+    ],
+)
+def test_what_is_not_yaml_is_told_with_its_line_alone(line: str, message: str) -> None:
+    with pytest.raises(SystemFileError, match=message) as caught:
+        parse_system_file(f"name: x\nbodies:\n{line}\n")
+    assert "unicode string" not in str(caught.value)

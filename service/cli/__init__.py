@@ -72,4 +72,6 @@ def describe(error: Exception) -> str:
         return one_line(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
     if isinstance(error, ValueError):  # what every folder raises for input that cannot be used
         return one_line(str(error))
+    if type(error).__name__ == "OperationalError":  # of SQLAlchemy: read-only, full, locked for long, out of reach
+        return one_line(": ".join([*getattr(error, "__notes__", []), str(getattr(error, "orig", error))]))
     return f"unexpected {type(error).__name__}: {one_line(str(error))}; SPRUNG_DEBUG=1 shows where"

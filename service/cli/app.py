@@ -9,7 +9,7 @@ import typer
 
 from sprung import __version__
 from sprung.service.cli import fleet_commands, store_commands
-from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights
+from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, vehicle_name
 from sprung.service.cli.plain import PlainTyper
 from sprung.service.processes.threads import hand_over_often, one_thread_each
 
@@ -39,7 +39,12 @@ Start = Annotated[
 ]
 Vehicle = Annotated[
     str | None,
-    typer.Option("--vehicle", metavar="NAME", help="Vehicle; default: as recorded, else the file's name."),
+    typer.Option(
+        "--vehicle",
+        metavar="NAME",
+        help="Vehicle; default: as recorded, else the file's name.",
+        callback=vehicle_name,
+    ),
 ]
 
 

@@ -8,8 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
+
+MOST_COLUMNS = 1000  # of a table in a pipe
 
 
 def errors() -> Console:
@@ -18,19 +21,26 @@ def errors() -> Console:
 
 
 def width_of_output() -> int:
-    """Columns of the terminal; of a pipe those that COLUMNS says, else enough for everything."""
+    """Columns of the terminal; of a pipe those that COLUMNS says, else enough for all columns of a table."""
     console = Console()
     if console.is_terminal:
         return console.width
+    return _columns_wanted() or 120
+
+
+def _columns_wanted() -> int | None:
     columns = os.environ.get("COLUMNS", "")
-    return int(columns) if columns.isdigit() and int(columns) > 0 else 120
+    return int(columns) if columns.isdigit() and int(columns) > 0 else None
 
 
 def print_table(table: Table) -> None:
     """On stdout; in a pipe as wide as it needs to be, without colours.  Names in brackets are no markup."""
     console = Console(highlight=False, markup=False)
     if not console.is_terminal:
-        console = Console(highlight=False, markup=False, width=width_of_output(), no_color=True)
+        wide = Console(highlight=False, markup=False, width=MOST_COLUMNS, no_color=True)
+        needed = Measurement.get(wide, wide.options, table).maximum
+        width = width_of_output() if _columns_wanted() else max(width_of_output(), needed)
+        console = Console(highlight=False, markup=False, width=width, no_color=True)
     console.print(table)
 
 

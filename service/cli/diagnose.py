@@ -108,9 +108,12 @@ def text(report: Report) -> str:
     lines = [f"{report.recording.file}: {report.verdict.replace('_', ' ')}"]
     if report.summary:
         lines.append(report.summary)
+    several = len(report.findings) > 1
     for finding in report.findings:
         values = ", ".join(f"{p.name} {p.words()}" for p in finding.parameters)
-        lines.append(finding.sentence or f"{finding.location}: {finding.effect} ({values})")
+        sentence = finding.sentence or f"{finding.location}: {finding.effect} ({values})"
+        if sentence not in report.summary or (several and finding.advice):  # else it has been said
+            lines.append(sentence)
         if finding.advice:
             lines.append(f"  {finding.advice}")
     lines.append(
@@ -119,4 +122,4 @@ def text(report: Report) -> str:
         f"{100 * report.noise_floor.nrmse:.1f} % is noise"
     )
     used = [report.recording.used] if report.recording.used else []
-    return "\n".join([*lines, *used, *report.changes, *report.advice])
+    return "\n".join([*lines, *used, *report.changes, *report.advice]).replace("+-", "±")

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights
+from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, vehicle_name
 from sprung.service.processes.threads import one_thread_each
 
 Place = Annotated[str, typer.Argument(help="Folder of recordings, or an address such as s3://bucket/folder.")]
@@ -33,7 +33,8 @@ def edge(
         str | None, typer.Option("--token", envvar="SPRUNG_TOKEN", help="With scope ingest; better in SPRUNG_TOKEN.")
     ] = None,
     vehicle: Annotated[
-        str | None, typer.Option("--vehicle", metavar="NAME", help="What this vehicle is called.")
+        str | None,
+        typer.Option("--vehicle", metavar="NAME", help="What this vehicle is called.", callback=vehicle_name),
     ] = None,
     spool: Annotated[
         Path | None, typer.Option("--spool", metavar="FILE", help="What waits to be sent; default: in the data folder.")

@@ -30,6 +30,18 @@ StoreUrl = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="JSON lines on stdout, for machines.")]
 
 
+def vehicle_name(name: str | None) -> str | None:
+    """An option's name of a vehicle: other names would be made fit in silence, and two of them the same.
+
+    Errors: `UserError`.
+    """
+    from sprung.service.sources.feed import vehicle_of
+
+    if name is not None and name != (fit := vehicle_of(name, None, "vehicle")):
+        raise UserError(f"--vehicle {name!r}: letters, digits and . _ : - only, at most 128; {fit!r} would do")
+    return name
+
+
 def time_of(option: str, text: str | None, default: int) -> int:
     """An option's time in nanoseconds.  Errors: `UserError`."""
     try:

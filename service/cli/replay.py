@@ -8,6 +8,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -164,7 +165,7 @@ def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
     if json_lines:
         print(json.dumps({"summary": summary(pipeline, view, fed)}), flush=True)
     else:
-        print_table(parameter_table(view, width_of_output()))
+        print_table(parameter_table(replace(view, health=health(view, fed)), width_of_output()))
         print(closing_line(view, fed))
     complaint = incomplete_line(path, fed)
     for line in fed.problems:
@@ -220,9 +221,10 @@ def closing_line(view: VehicleView, fed: Fed) -> str:
         lines.append(f"{fed.stored_before} windows were in the store already")
     for alarm in view.active:
         what = changed_part(alarm) or "windows no longer fit the model"
+        advice = "; `sprung diagnose` looks for the cause" if alarm.kind == "misfit" else ""
         change = f" {size_in_words(alarm.parameter, alarm.change, alarm.std)}".rstrip()
         apart = "; the measurements do not distinguish them" if alarm.alternatives else ""
-        lines.append(f"{alarm.severity}: {what}{change} since {to_iso(alarm.onset)}{apart}")
+        lines.append(f"{alarm.severity}: {what}{change} since {to_iso(alarm.onset)}{apart}{advice}")
     return "\n".join([*lines, *measurement_lines(view.measurements())])
 
 
@@ -240,7 +242,7 @@ def measurement_lines(found: dict[str, Any]) -> list[str]:
     loads = found.get("load") or {}
     before = f", as of {found['load_as_of']}; not observable since" if found.get("load_as_of") else ""
     return lines + [
-        f"load: {body} {mass:+.0f} ± {std:.0f} kg against nominal{before}" for body, (mass, std) in loads.items()
+        f"load: {body} {mass:+z.0f} ± {std:.0f} kg against nominal{before}" for body, (mass, std) in loads.items()
     ]
 
 

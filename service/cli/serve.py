@@ -5,13 +5,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sprung.service.cli.console import print_table, width_of_output
 from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.progress import plain_progress
-from sprung.service.cli.replay import closing_line, incomplete_line, readable
+from sprung.service.cli.replay import closing_line, health, incomplete_line, readable
 from sprung.service.cli.targets import check_folder
 from sprung.service.core import Core
 from sprung.service.main import Feeds, serve
@@ -48,7 +49,7 @@ def watch(path: Path, core: Core) -> tuple[OnBatch, Callable[[Fed], None]]:
     def on_end(fed: Fed) -> None:
         assert fed.state is not None
         view = vehicle_view(core.engine, fed.vehicle, fed.state, None)
-        print_table(parameter_table(view, width_of_output()))
+        print_table(parameter_table(replace(view, health=health(view, fed)), width_of_output()))
         print(closing_line(view, fed), flush=True)
         complaint = incomplete_line(path, fed)
         if complaint:

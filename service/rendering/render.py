@@ -78,4 +78,4 @@ def percent(share: float | None, digits: int = 1) -> str:
     """`+2.3 %`; a dash where there is nothing to say."""
     if share is None or not math.isfinite(share):
         return "–"
-    return f"{100 * share:+.{digits}f} %"
+    return f"{100 * share:+z.{digits}f} %"

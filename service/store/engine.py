@@ -20,7 +20,7 @@ from alembic.util import CommandError
 from pydantic_core import to_json
 from sqlalchemy import URL, Connection, Engine, Table, create_engine, event, text
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.engine import make_url
+from sqlalchemy.engine import ExceptionContext, make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
 
 from sprung.service.errors import UserError
@@ -39,6 +39,7 @@ class Store:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
+        event.listen(engine, "handle_error", _name_store)
         self.many_writers = engine.dialect.name == "postgresql"
         # one writer a process where the database has one anyway: waiting is fair here
         self._writing = threading.BoundedSemaphore(MOST_WRITERS if self.many_writers else 1)
@@ -221,6 +222,12 @@ def _on_sqlite_connect(connection: Any, _record: Any) -> None:
 def _on_sqlite_begin(connection: Connection) -> None:
     writes = connection.get_execution_options().get("sprung_write", False)
     connection.execute(text("BEGIN IMMEDIATE" if writes else "BEGIN"))
+
+
+def _name_store(context: ExceptionContext) -> None:
+    """Let errors of the database say which one it is."""
+    if context.sqlalchemy_exception is not None and context.engine is not None:
+        context.sqlalchemy_exception.add_note(f"store {context.engine.url.render_as_string(hide_password=True)}")
 
 
 def _first_line(error: Exception) -> str:

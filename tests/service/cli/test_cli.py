@@ -152,6 +152,20 @@ def test_a_recording_with_losses_is_exit_status_one_and_one_line(
     assert f"{summary['samples']['lost']} of {summary['samples']['expected']} samples lost" in captured.err
 
 
+def test_a_vehicle_that_was_not_monitored_is_not_called_well_in_the_table(
+    tmp_path: Path, csv_system: Path, system: System, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / "lossy.csv", system, lambda _: 0.01, range(2000))
+    rows = list(csv.reader(path.read_text().splitlines()))
+    missing = {channel.can for channel in system.channels[-8:]}  # accelerometers, 29 % of the samples
+    kept = [i for i, name in enumerate(rows[0]) if name not in missing]
+    with open(path, "w", newline="") as target:
+        csv.writer(target).writerows([row[i] for i in kept] for row in rows)
+    assert main(["replay", str(path), "--system", str(csv_system)]) == 1
+    told = capsys.readouterr()
+    assert "not monitored" in told.err and told.out.startswith("lossy: check function")
+
+
 def test_replaying_into_a_store_twice_gives_the_same_lines_and_stores_nothing_twice(
     healthy: Path, csv_system: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,21 +11,29 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from can import BusState
 from mcap.reader import make_reader
+from sqlalchemy import text
+from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import MANCHESTER
 from sprung.service.cli import describe, main
+from sprung.service.cli.diagnose import text as text_of
 from sprung.service.cli.doctor import _bus
 from sprung.service.cli.parameters import parameter_table
-from sprung.service.cli.replay import incomplete_line, slower_line, told_when_interrupted
+from sprung.service.cli.replay import incomplete_line, measurement_lines, slower_line, told_when_interrupted
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.views import vehicle_view
+from sprung.service.rendering.render import percent
 from sprung.service.sources.feed import Fed
+from sprung.service.store import open_store
+from sprung.service.store.fleet import ensure_vehicle
+from tests.report_made import friction_report
 
 ROOT = Path(__file__).parents[3]
 RIDE = ROOT / "tests" / "data" / "drift-600s.blf"
@@ -108,6 +116,55 @@ def test_wrong_usage_points_to_the_help_of_its_command(capsys: pytest.CaptureFix
 
 def test_what_is_no_usage_error_is_one_line() -> None:
     assert describe(ValueError("two\nlines")) == "two lines"
+
+
+def test_a_store_that_cannot_be_written_is_named_and_why(tmp_path: Path) -> None:
+    store = open_store(str(tmp_path / "s.db"))
+    with pytest.raises(OperationalError) as caught, store.write() as connection:
+        connection.execute(text("PRAGMA query_only = ON"))  # as a file without permission to write
+        ensure_vehicle(connection, "v", 0)
+    store.close()
+    assert describe(caught.value) == f"store sqlite:///{tmp_path}/s.db: attempt to write a readonly database"
+
+
+@pytest.mark.parametrize(
+    ("name", "instead"), [("Zug 17/ä", "Zug_17__"), ("", "vehicle"), ("a\nb", "a_b"), ("x" * 300, "x" * 128)]
+)
+def test_a_name_that_no_vehicle_can_have_is_refused_with_one_that_it_can(
+    name: str, instead: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in (["replay", str(RIDE)], ["serve", "--port", "0"], ["edge", str(RIDE)]):
+        assert main([*command, "--vehicle", name]) == 2
+        told = capsys.readouterr().err
+        assert len(told.splitlines()) == 1 and told.startswith(f"sprung: --vehicle {name!r}: letters, digits")
+        assert f"; {instead!r} would do" in told
+
+
+def test_a_table_in_a_pipe_breaks_no_name(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    path, name = tmp_path / "signals.csv", "a very long name of a signal " * 5
+    path.write_text(f"time,{name.strip()},b\n" + "".join(f"{i / 100},{i},{i % 7}\n" for i in range(100)))
+    assert main(["inspect", str(path)]) == 0
+    assert name.strip() in capsys.readouterr().out
+
+
+def test_a_finding_is_told_once_unless_advice_hangs_on_it() -> None:
+    report = friction_report()
+    place = report.findings[0].location
+    found = replace(report.findings[0], sentence=f"{place}: dry friction of 395 +- 6 N")
+    told = text_of(replace(report, findings=(found,), summary=f"{found.sentence}; explains 99 %.")).splitlines()
+    assert [line for line in told if "friction" in line] == [f"{place}: dry friction of 395 ± 6 N; explains 99 %."]
+    advised = tuple(replace(found, sentence=f"{one} {found.sentence}", advice="look") for one in "ab")
+    summary = "; ".join(one.sentence for one in advised)
+    told = text_of(replace(report, findings=advised, summary=summary)).splitlines()
+    assert [told[i - 1][:1] for i, line in enumerate(told) if line == "  look"] == ["a", "b"]
+
+
+def test_a_load_that_is_none_has_no_minus() -> None:
+    assert measurement_lines({"load": {"car": [-0.3, 9.0]}}) == ["load: car +0 ± 9 kg against nominal"]
+    assert percent(-0.0001) == "+0.0 %"
 
 
 def test_narrow_tables_keep_whole_names(engine: Engine) -> None:
