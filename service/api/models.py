@@ -197,7 +197,7 @@ class VehicleLine(BaseModel):
     vehicle: str
     label: str | None
     health: Health
-    last_window: str | None = Field(description="start of the newest window, as recorded")
+    last_window: str | None = Field(description="start of the newest window, as recorded; null: none has come yet")
     received: str | None = Field(description="when it came, by the service's clock")
     silent: bool = Field(description="nothing came for longer than SPRUNG_SILENT_SECONDS")
     alarms: int = Field(description="active ones of either severity")

@@ -37,6 +37,11 @@ def test_a_vehicle_of_which_nothing_was_heard_is_not_called_good(client: TestCli
     for path in ("/", "/pages/vehicles/new"):
         page = client.get(path, headers=BROWSER).text
         assert "no window yet" in page and '<span class="badge ok">' not in page
+    listed, alone = client.get("/vehicles").json(), client.get("/vehicles/new").json()
+    for one in (listed["vehicles"][0], alone):
+        assert (one["vehicle"], one["health"], one["last_window"]) == ("new", "check_function", None)
+    assert (listed["counts"]["ok"], listed["counts"]["check_function"]) == (0, 1)
+    assert client.get("/vehicles?health=ok").json()["vehicles"] == []
 
 
 def test_a_page_never_repeats_a_path_as_markup(client: TestClient) -> None:

@@ -18,7 +18,7 @@ from sqlalchemy import func, select, text
 from sprung.model.tracking.state import Alarm
 from sprung.service.errors import UserError
 from sprung.service.fleet.local_postgres import PostgresServer
-from sprung.service.store import Store, fleet, history, open_store, partitions, retention, work
+from sprung.service.store import Store, fleet, history, open_store, partitions, retention, status, work
 from sprung.service.store.schema import metadata, windows
 from sprung.service.store.windows import (
     Posterior,
@@ -78,6 +78,24 @@ def test_sqlite_runs_in_wal_mode_with_foreign_keys(store: Store) -> None:
         assert connection.execute(text("PRAGMA journal_mode")).scalar_one() == "wal"
         assert connection.execute(text("PRAGMA foreign_keys")).scalar_one() == 1
         assert connection.execute(text("PRAGMA synchronous")).scalar_one() == 2  # FULL
+
+
+def test_vehicles_that_an_earlier_version_called_well_unheard_are_not_called_so_any_more(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    store = open_store(str(path))
+    fill(store, [])
+    with store.write() as connection:
+        for vehicle in ("unheard", "heard"):
+            fleet.ensure_vehicle(connection, vehicle, START)
+        connection.execute(text("update fleet_status set health = 'ok'"))
+        connection.execute(text("update fleet_status set revision = 1, last_window_ns = 1 where vehicle_id = 'heard'"))
+        connection.execute(text("update alembic_version set version_num = '0009'"))
+    store.close()
+    store = open_store(str(path))
+    with store.read() as connection:
+        health = {row.id: row.health for row in status.fleet_page(connection, status.Wanted(), "id", 9)}
+    store.close()
+    assert (health["unheard"], health["heard"]) == ("check_function", "ok")
 
 
 def test_a_store_of_a_newer_version_is_refused_in_words_and_left_alone(tmp_path: Path) -> None:
