@@ -62,6 +62,16 @@ class RecordRules:
     stuck_samples: int = rule(20, "at least, the same; derived: coarse steps of slow channels repeat for less", 10, 40)
     resting: float = rule(0.5, "of the channels that repeat a value together: standstill; chosen", 0.3, 0.7)
     held: float = rule(0.05, "Hz; derived: a slower mode is one that no stiffness holds", 0.02, 0.1)
+    compared: float = rule(
+        0.3, "of the sample rate, up to which spectra are compared; derived: anti-alias filters", 0.25, 0.35
+    )
+    end_samples: int = rule(
+        9, "that determine the slope at an end of a record; chosen: more bend, fewer are noise", 7, 13
+    )
+    end_degree: int = rule(4, "of the polynomial through them; chosen", 3, 6)
+    end_degree_integrated: int = rule(
+        7, "the same of an integrated acceleration; chosen: its fast noise is small, and fast motion is not", 5, 8
+    )
     least_noise: float = rule(0.2, "of a declared noise that an estimate may fall to; chosen: data sheets", 0.1, 0.4)
 
 
@@ -93,6 +103,12 @@ class ScreeningRules:
     of_shapes: float = rule(4.0, "score by chance, of the shapes of an unnamed force; derived: 2 log 7", 2.0, 6.0)
     of_places: float = rule(9.0, "the same of the places of a missing part; derived: 2 log 100", 7.0, 12.0)
     of_lines: float = rule(22.0, "the same of frequencies and phases; derived: 2 log 60 000", 18.0, 26.0)
+    reaction: float = rule(
+        0.02,
+        "relative error of columns with the laws' reaction; derived: slopes of laws from sample to sample",
+        0.01,
+        0.05,
+    )
     lowest_mode: float = rule(1.0, "Hz; derived: below, an elastic mode is a rigid one of a train's body", 0.5, 2.0)
     highest_mode: float = rule(0.4, "of the sample rate; derived: there anti-alias filters cut", 0.3, 0.45)
     mode_damping: float = rule(0.01, "ratio of trial modes, and three times that; chosen: car bodies", 0.005, 0.02)
@@ -274,6 +290,8 @@ class SetupRules:
     above: float = rule(1.3, "times the fastest mode, above which only masses matter; chosen", 1.15, 1.6)
     by_mass: float = rule(0.5, "of the misfit there, that an explanation may leave; chosen", 0.35, 0.65)
     soonest: float = rule(0.75, "samples of a delay there; derived: rounding a clock makes half of one", 0.5, 1.5)
+    gravity_least: float = rule(5.0, "ratio by spectra alone, that may be standard gravity; chosen", 3.0, 7.0)
+    gravity_most: float = rule(20.0, "the same; chosen", 14.0, 30.0)
     gravity: float = rule(0.1, "of a log-ratio, within which it is standard gravity; chosen", 0.05, 0.2)
 
 

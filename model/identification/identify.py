@@ -104,24 +104,37 @@ class Identifier:
             return []
         begin = time.perf_counter()
         self._allow(windows)
-        explainer, everything = self._explainer(windows.shape[1]), np.arange(len(windows))
-        moved = self._refiner(windows.shape[1]).model.excitation(windows) > EXCITED
-        explained = explainer.again(windows, {b: its for b, its in enumerate(known) if its and moved[b]})
-        contradicted = moved & explainer.contradictions.contradicted(windows)
-        explained |= explainer.contradictory(windows, _left(np.flatnonzero(contradicted), explained))
-        plain = _left(everything, explained)
+        explainer = self._explainer(windows.shape[1])
+        explained, contradicted = self._explained_beforehand(windows, known, explainer)
+        plain = _left(np.arange(len(windows)), explained)
         found, estimating = self._plainly(windows[plain], weigh[plain], None if start is None else start[plain])
         asks = contradicted[plain] | np.array([e.informative and self._asks(e, explainer) for e in found], dtype=bool)
         explained |= explainer.explain(windows, plain[asks])
         whole = dict(zip(plain.tolist(), found, strict=True)) | {b: self._restored(e) for b, e in explained.items()}
-        for b in _left(everything, explained).tolist():
+        for b in _left(plain, explained).tolist():
             if not whole[b].informative:
                 whole[b] = replace(whole[b], faults=explainer.stuck.all_inputs(windows[b]))
-        for b in [*explained, *plain[asks].tolist()] if self._work.ended else ():
-            if whole[b].identified and not whole[b].adequate:
-                whole[b] = replace(whole[b], reason=NOT_EXPLAINED + self._limit)
+        if self._work.ended:
+            whole |= {b: self._as_far_as_looked_into(whole[b]) for b in [*explained, *plain[asks].tolist()]}
         self.times = StageTimes(estimating, time.perf_counter() - begin - estimating)
-        return [whole[b] for b in everything.tolist()]
+        return [whole[b] for b in range(len(windows))]
+
+    def _explained_beforehand(
+        self, windows: FloatArray, known: Sequence[tuple[MeasurementFault, ...]], explainer: Explainer
+    ) -> tuple[dict[int, Explained], BoolArray]:
+        """Windows, by index, with the faults that their vehicle had before or with redundant channels that contradict
+        each other, put right; and which windows contain such a contradiction, (B,)."""
+        moved = self._refiner(windows.shape[1]).model.excitation(windows) > EXCITED
+        explained = explainer.again(windows, {b: its for b, its in enumerate(known) if its and moved[b]})
+        contradicted = moved & explainer.contradictions.contradicted(windows)
+        explained |= explainer.contradictory(windows, _left(np.flatnonzero(contradicted), explained))
+        return explained, contradicted
+
+    def _as_far_as_looked_into(self, estimate: Estimate) -> Estimate:
+        """An estimate for which no more faults are tried, since the time is over."""
+        if estimate.identified and not estimate.adequate:
+            return replace(estimate, reason=NOT_EXPLAINED + self._limit)
+        return estimate
 
     def _plainly(self, windows: FloatArray, weigh: BoolArray, start: FloatArray | None) -> tuple[list[Estimate], float]:
         """Windows (B, T, C) as a tracker wants them, taken for right; and the seconds that their start took."""
@@ -302,37 +315,46 @@ def _deviating(
     spread: standard deviations of the priors of what follows gains and delays.
     """
     X = refined.log_ratio.shape[1] - P  # of loads and bodies' own that were refined along
-    whole, loaded = bool(refined.weighed[b]), X > 0
-    if not (whole or loaded):
+    whole = bool(refined.weighed[b])
+    if not (whole or X > 0):
         return None
     C, H = channels, 2 * channels + len(spread)
-    prior = spread[:X] ** -2 / max(refined.chi_square[b], 1.0)  # in the refined values, not of the window
-    at = np.zeros(H) if point is None else point.copy()
-    covariance = refined.covariance[b]
+    at, covariance = np.zeros(H) if point is None else point.copy(), refined.covariance[b]
     cross = refined.cross[b] if whole else np.zeros((len(covariance), H))
     information = refined.information[b].copy() if whole else np.zeros((H, H))
     score = refined.score[b].copy() if whole else np.zeros(H)
     given = covariance[:P, :P]
-    if loaded:
+    if X > 0:
         loads = slice(2 * C, 2 * C + X)
-        at[loads] = refined.log_ratio[b, P:]
-        inverse = np.linalg.inv(covariance[P:, P:])
-        per_load = covariance[:P, P:] @ inverse  # (P, loads)
-        if whole:
-            moved = cross[P:, : 2 * C]  # of the loads per gain or delay
-            information[: 2 * C, : 2 * C] += moved.T @ inverse @ moved
-            information[: 2 * C, loads] = -moved.T @ inverse
-            information[loads, : 2 * C] = information[: 2 * C, loads].T
-            cross = cross[:P] - np.pad(per_load @ moved, ((0, 0), (0, H - 2 * C)))
-        information[loads, loads] = inverse - np.diag(prior)
-        score[loads] = prior * refined.log_ratio[b, P:]
-        given = given - per_load @ covariance[P:, :P]
-        cross[:P, loads] = per_load
-    if (
-        point is not None
-    ):  # samples were divided by the gain: a relative deviation of what is left counts that much less
+        prior = spread[:X] ** -2 / max(refined.chi_square[b], 1.0)  # in the refined values, not of the window
+        at[loads], score[loads] = refined.log_ratio[b, P:], prior * refined.log_ratio[b, P:]
+        given, cross, information = _profiled(covariance, cross, information, loads, P)
+        information[loads, loads] -= np.diag(prior)
+    if point is not None:  # samples were divided by the gain: a relative deviation of the rest counts less by it
         scale = np.ones(H)
         scale[:C] = 1 / (1 + at[:C])
         cross, score = cross * scale, score * scale
         information = information * np.outer(scale, scale)
     return Deviating(at, given, cross[:P], information, score, float(refined.freedom[b]), whole)
+
+
+def _profiled(
+    covariance: FloatArray, cross: FloatArray, information: FloatArray, loads: slice, P: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Loads that were refined after the P parameters, as deviations beside gains and delays.
+
+    covariance (P + X, P + X) and cross (P + X, H): of what was refined, and per deviation; information (H, H) on gains
+    and delays.  Returns the covariance of the parameters given the loads (P, P), `cross` of the parameters with the
+    loads in place, (P, H), and the information with that on the loads, without a prior.
+    """
+    inverse = np.linalg.inv(covariance[P:, P:])
+    per_load = covariance[:P, P:] @ inverse  # (P, X)
+    moved = cross[P:, : loads.start]  # of the loads per gain or delay; 0 of windows that are not weighed
+    information[: loads.start, : loads.start] += moved.T @ inverse @ moved
+    information[: loads.start, loads] = -moved.T @ inverse
+    information[loads, : loads.start] = information[: loads.start, loads].T
+    information[loads, loads] = inverse
+    cross = cross[:P].copy()
+    cross[:, : loads.start] -= per_load @ moved
+    cross[:, loads] = per_load
+    return covariance[:P, :P] - per_load @ covariance[P:, :P], cross, information

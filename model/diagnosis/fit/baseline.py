@@ -70,8 +70,8 @@ def _begun(
 ) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
     declared = seen_noise(first, declared, rules.noise.misdeclared)
-    noise = input_noise(transform(first, declared), declared)
-    part = transform(first, noise, differentiated=drifting(system, signals.sensor_index))
+    noise = input_noise(transform(first, declared, rules.record), declared)
+    part = transform(first, noise, rules.record, differentiated=drifting(system, signals.sensor_index))
     problem = Problem(system, part, signals.sensor_index, noise, rules, memory, work)
     start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(0))
     start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
@@ -94,7 +94,8 @@ def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, sta
         count = signals.samples // share
         if count < _FEWEST:
             continue
-        part = transform(signals.part(0, count), declared, differentiated=drifting(problem.system, problem.sensors))
+        differentiated = drifting(problem.system, problem.sensors)
+        part = transform(signals.part(0, count), declared, problem.rules.record, differentiated=differentiated)
         fit = try_optimise(replace(problem, part=part), replace(start, theta=theta), _STEPS)
         if fit is not None:
             theta = fit.point.theta

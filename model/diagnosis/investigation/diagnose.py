@@ -182,7 +182,7 @@ def _without_input_faults(
 def _on_whole_recording(state: Investigation) -> Fit:
     """The model fitted to the whole recording after its validation; that of the first part if the fit diverges."""
     differentiated = drifting(state.system, state.signals.sensor_index)
-    part = transform(state.signals, state.problem.noise, differentiated=differentiated)
+    part = transform(state.signals, state.problem.noise, state.options.rules.record, differentiated=differentiated)
     problem = replace(state.problem, part=part, work=None)
     fit = try_optimise(problem, state.held.run(state.fit.point).point, 4)
     most = state.options.rules.acceptance.diverged * state.fit.reduced

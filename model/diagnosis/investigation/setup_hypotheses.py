@@ -29,7 +29,6 @@ from sprung.model.system import System
 
 _ORDERS = {"acceleration": 2, "velocity": 1, "displacement": 0}  # derivatives that a sensor of a point shows
 _STANDARD_GRAVITY = 9.80665  # m/s^2
-_GRAVITY_ROUGHLY = (5.0, 20.0)  # ratios before parameters are fitted beside them
 _ALIKE = 1e-6  # m, of positions that mirror each other
 
 
@@ -207,7 +206,7 @@ def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
         if len(group.supports) == len(wired.signals.support_names) > 1:
             continue  # the same as all sensors the other way
         ratio = one.ratio(group)
-        if wired.all_accelerations and _GRAVITY_ROUGHLY[0] < ratio < _GRAVITY_ROUGHLY[1]:
+        if wired.all_accelerations and rules.gravity_least < ratio < rules.gravity_most:
             continue  # the others are in g: they show less by as much
         if np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale):
             misfit = one.misfit(one.scaled(group, ratio))

@@ -36,7 +36,7 @@ class SetupScores:
         self.problem, part = problem, problem.part
         self.theta = np.zeros_like(fit.point.theta) if nominal else fit.point.theta
         stride = 1 if most is None else max(1, part.grid.band.stop // most)
-        self.grid = ThinnedGrid(part.grid.samples, part.grid.step, part.grid.start, stride=stride)
+        self.grid = ThinnedGrid(part.grid.samples, part.grid.step, part.grid.start, part.grid.compared, stride=stride)
         self.band = slice(stride, part.grid.band.stop, stride)  # the same, without zero frequency
         self.weight = 1 / np.sqrt(np.maximum(np.sum(np.abs(part.sensors[self.band]) ** 2, axis=0), 1e-300))
         self.predicted = self._predict(problem.system, self.theta)

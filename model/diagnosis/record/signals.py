@@ -30,9 +30,6 @@ from sprung.model.system import System
 _UNDECLARED = 1e-3  # of a signal, noise that is not declared
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
 _SEEN = 1e-9  # of a rigid-body motion
-_END = 9  # samples that determine the slope at an end of a record
-_END_DEGREE = 4  # of the polynomial through them, of a support's motion
-_INTEGRATED_DEGREE = 7  # the same of an integrated acceleration, whose fast noise is small, and fast motion is not
 
 
 @dataclass(frozen=True)
@@ -198,72 +195,91 @@ def drifting(system: System, sensors: np.ndarray) -> np.ndarray:
     return found
 
 
-def rate_of(position: FloatArray, grid: Grid) -> FloatArray:
+def rate_of(position: FloatArray, grid: Grid, rules: RecordRules = RULES.record) -> FloatArray:
     """Time derivative of series (N, m), exact within the band: what their ends leave open is a parabola's."""
-    polynomial = detrend_ends(position, _end_slopes(position, grid, 2), grid)
+    polynomial = detrend_ends(position, _end_slopes(position, grid, rules.end_samples, 2), grid)
     rest = grid.forward(position - grid.monomials @ polynomial)
     slope = grid.monomials @ derivative(polynomial, grid.length)
     return np.asarray(grid.inverse(1j * grid.omega[:, None] * rest) + slope)
 
 
-def _end_slopes(series: FloatArray, grid: Grid, degree: int) -> tuple[FloatArray, FloatArray]:
+def _end_slopes(series: FloatArray, grid: Grid, count: int, degree: int) -> tuple[FloatArray, FloatArray]:
     """Slopes of series (N, m) at the first and the last sample, per second, each (m,), of polynomials through few."""
-    ends = np.vander(np.arange(min(_END, len(series))) * grid.step, degree + 1)
+    ends = np.vander(np.arange(min(count, len(series))) * grid.step, degree + 1)
     first, last = (np.linalg.lstsq(ends, part[: len(ends)], rcond=None)[0][-2] for part in (series, series[::-1]))
     return first, -last
 
 
-def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None = None) -> Part:
+def transform(
+    signals: Signals, noise: Noise, rules: RecordRules = RULES.record, *, differentiated: np.ndarray | None = None
+) -> Part:
     """Spectra of a part.
 
     `differentiated`: sensors whose series are compared by their rates (`drifting`), (S,).
     """
-    grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start, signals.cutoff)
-    differentiated = np.zeros(signals.sensors.shape[1], dtype=bool) if differentiated is None else differentiated
+    grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start, rules.compared, signals.cutoff)
     sensors = signals.sensors
+    differentiated = np.zeros(sensors.shape[1], dtype=bool) if differentiated is None else differentiated
     if differentiated.any():
-        sensors = np.where(differentiated, rate_of(sensors, grid), sensors)
-    omega = grid.omega[:, None]
+        sensors = np.where(differentiated, rate_of(sensors, grid, rules), sensors)
     has_rate = np.isfinite(noise.velocity) & ~signals.accelerated
-    d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
-    polynomial = np.zeros((grid.monomials.shape[1], d.shape[1]))
-    if d.shape[1]:
-        plain, integrated_slopes = (_end_slopes(d, grid, degree) for degree in (_END_DEGREE, _INTEGRATED_DEGREE))
-        slopes = [np.where(signals.accelerated, *pair) for pair in zip(integrated_slopes, plain, strict=True)]
-        first, last = (np.where(has_rate, v[at], slope) for at, slope in zip((0, -1), slopes, strict=True))
-        polynomial = detrend_ends(d, (first, last), grid)
-    slope = np.zeros_like(polynomial)
-    slope[:-1] = polynomial[1:] * np.arange(1, len(polynomial))[:, None] / grid.length
-    D = grid.forward(d - grid.monomials @ polynomial)
-    V = grid.forward(v - grid.monomials @ slope)
-    integrated = np.zeros_like(V)
-    integrated[1:] = V[1:] / (1j * omega[1:])
-    integrated[0] = D[0]
-    precision_d = 1 / noise.displacement**2
-    precision_v = np.where(has_rate, (omega / noise.velocity) ** 2, 0.0)
-    fused = (D * precision_d + integrated * precision_v) / (precision_d + precision_v)
+    polynomial, D, V = _support_spectra(signals, has_rate, grid, rules)
     pairs = np.flatnonzero(has_rate & ~signals.integrated)
-    redundancy = (integrated - D)[:, pairs]
-    duration = (grid.samples - 1) * grid.step
-    mean_rate = trapezoid(v, dx=grid.step, axis=0) / duration
-    rate_offset = (mean_rate - (d[-1] - d[0]) / duration)[pairs]
     force_polynomial = np.zeros((grid.monomials.shape[1], signals.force.shape[1]))
     if signals.force.shape[1]:
         force_polynomial = detrend_ends(signals.force, None, grid)
     return Part(
         grid=grid,
-        support=np.asarray(fused, dtype=complex),
+        support=_fused(D, V, noise, has_rate, grid),
         support_polynomial=polynomial,
         force=grid.forward(signals.force - grid.monomials @ force_polynomial),
         force_polynomial=force_polynomial,
         sensors=grid.forward(sensors),
         differentiated=differentiated,
-        redundancy=redundancy,
+        redundancy=(V - D)[:, pairs],
         pairs=pairs,
-        rate_offset=rate_offset,
+        rate_offset=_rate_offset(signals, grid)[pairs],
         displacement=D,
-        velocity=integrated,
+        velocity=V,
         parity=tuple(
             one for fused in signals.fused if (one := parity_residuals(fused, grid.step, signals.averaged)) is not None
         ),
     )
+
+
+def _support_spectra(
+    signals: Signals, has_rate: np.ndarray, grid: Grid, rules: RecordRules
+) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+    """Polynomial of the supports' displacement (DEGREE + 1, supports), and what remains by either channel.
+
+    Spectra (F, supports) of the displacement channel, and of the velocity channel as displacement V / j w; has_rate:
+    supports that have one, (supports,).
+    """
+    d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
+    polynomial = np.zeros((grid.monomials.shape[1], d.shape[1]))
+    if d.shape[1]:
+        degrees = rules.end_degree_integrated, rules.end_degree
+        both = zip(*(_end_slopes(d, grid, rules.end_samples, degree) for degree in degrees), strict=True)
+        slopes = (np.where(signals.accelerated, *pair) for pair in both)
+        first, last = (np.where(has_rate, v[at], slope) for at, slope in zip((0, -1), slopes, strict=True))
+        polynomial = detrend_ends(d, (first, last), grid)
+    D = grid.forward(d - grid.monomials @ polynomial)
+    V = grid.forward(v - grid.monomials @ derivative(polynomial, grid.length))
+    integrated = np.zeros_like(V)
+    integrated[1:] = V[1:] / (1j * grid.omega[1:, None])
+    integrated[0] = D[0]
+    return polynomial, D, integrated
+
+
+def _fused(D: ComplexArray, V: ComplexArray, noise: Noise, has_rate: np.ndarray, grid: Grid) -> ComplexArray:
+    """Displacement of the supports by both channels, weighted by their noise (module docstring), (F, supports)."""
+    precision_d = 1 / noise.displacement**2
+    precision_v = np.where(has_rate, (grid.omega[:, None] / noise.velocity) ** 2, 0.0)
+    return np.asarray((D * precision_d + V * precision_v) / (precision_d + precision_v), dtype=complex)
+
+
+def _rate_offset(signals: Signals, grid: Grid) -> FloatArray:
+    """Mean of the velocity channel less that by the displacement's two ends, m/s, (supports,)."""
+    duration = (grid.samples - 1) * grid.step
+    mean_rate = trapezoid(signals.velocity, dx=grid.step, axis=0) / duration
+    return np.asarray(mean_rate - (signals.displacement[-1] - signals.displacement[0]) / duration)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import firwin, kaiserord, upfirdn
 
-from sprung.model.diagnosis.record.spectra import BAND
 from sprung.model.diagnosis.rules import RecordRules
 from sprung.model.mechanics import DISPLACEMENT
 from sprung.model.signals import FloatArray
@@ -40,7 +39,7 @@ def slower_by(system: System, values: FloatArray, sample_rate: float, rules: Rec
     power, of_noise = power * rates, of_noise * rates
 
     def loses_nothing(factor: int) -> bool:
-        compared = BAND * sample_rate / factor
+        compared = rules.compared * sample_rate / factor
         if fastest * rules.modes_within > compared:
             return False
         above = frequency > compared

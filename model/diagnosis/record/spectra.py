@@ -24,7 +24,6 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 DEGREE = 5  # of the polynomials: quadratic inputs, integrated twice by a free body
 OVERSAMPLING = 4  # laws with kinks make harmonics beyond the Nyquist frequency of the record
-BAND = 0.30  # of the sample rate: above it anti-alias filters attenuate
 HIGH_PASS_ORDER = 4  # Butterworth, run forwards and backwards
 
 
@@ -42,6 +41,7 @@ class Grid:
     samples: int
     step: float
     start: float = 0.0  # s, time of the first sample of this part since the start of the recording
+    compared: float = 0.3  # of the sample rate, up to which spectra are compared
     cutoff: float = 0.0  # Hz, of the high-pass filter that all signals have passed (`highpass`); 0: none
 
     @cached_property
@@ -57,7 +57,7 @@ class Grid:
     @cached_property
     def band(self) -> slice:
         """Bins that are compared."""
-        return slice(0, max(2, int(BAND * self.samples)))
+        return slice(0, max(2, int(self.compared * self.samples)))
 
     @cached_property
     def weight(self) -> FloatArray:

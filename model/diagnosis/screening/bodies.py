@@ -21,8 +21,6 @@ from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
 from sprung.model.mechanics import ACCELERATION, VELOCITY
 from sprung.model.signals import FloatArray
 
-_TANGENT = 0.02  # relative error of columns with the reaction of laws, whose slopes are taken from sample to sample
-
 
 def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
     """The best trial of every body law at every body, with the number of trials."""
@@ -49,7 +47,7 @@ def _masses(projector: Projector, law: BodyLaw) -> Iterator[tuple[Candidate, int
     loads = [np.where(own, -structure.mass * fit.motions.acceleration, 0.0) for own in dofs]
     if held and fit.forces is not None and not problem.process_noise:
         columns = sensitivities_to_loads(problem, fit.forward, fit.forces, fit.whitener, loads)
-        scores = [projector.score(column, least=_TANGENT**2) for column in columns.T]
+        scores = [projector.score(column, least=problem.rules.screening.reaction**2) for column in columns.T]
     else:
         shown = [projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load[band])) for load in loads]
         spreads = [

@@ -79,14 +79,13 @@ class HeldOut:
     @cached_property
     def whole(self) -> Part:
         """The whole recording, for simulation."""
-        return transform(self.signals, self.noise)
+        return transform(self.signals, self.noise, self.rules.record)
 
     @cached_property
     def later(self) -> Part:
         """The held-out part, for comparison: drifting positions are differentiated."""
-        return transform(
-            self.signals.part(self.split, self.signals.samples), self.noise, differentiated=self.differentiated
-        )
+        signals = self.signals.part(self.split, self.signals.samples)
+        return transform(signals, self.noise, self.rules.record, differentiated=self.differentiated)
 
     @property
     def grid(self) -> Grid:
@@ -95,7 +94,7 @@ class HeldOut:
     @cached_property
     def tracked(self) -> Part:
         """The whole recording, for smoothing: drifting positions are differentiated."""
-        return transform(self.signals, self.noise, differentiated=self.differentiated)
+        return transform(self.signals, self.noise, self.rules.record, differentiated=self.differentiated)
 
     @property
     def still(self) -> bool:
@@ -129,7 +128,7 @@ class HeldOut:
         fitted anew, to the fitted part only.
         """
         point, part = self._up_to_split(point)
-        problem = Problem(self.system, part, self.signals.sensor_index, self.noise)
+        problem = Problem(self.system, part, self.signals.sensor_index, self.noise, self.rules)
         state = np.zeros_like(point.state)
         trained = slice(0, self.split)
         weights = 1 / self.noise.sensors
@@ -170,7 +169,7 @@ class HeldOut:
 
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
         """Whitened residual of the held-out part along the smoothed motion, and its log determinant."""
-        problem = Problem(self.system, self.later, self.signals.sensor_index, fit.noise)
+        problem = Problem(self.system, self.later, self.signals.sensor_index, fit.noise, self.rules)
         point, working = along_measured_motion(problem, replace(fit.point, warm_start=()))
         shown, forward, _ = problem.predict(point, working.inputs)
         free = self.later.grid.forward(forward.free_rows() @ point.state)
@@ -182,14 +181,14 @@ class HeldOut:
         Its warm start then holds the laws' forces along the smoothed motion.
         """
         signals = self.signals
-        follower = Problem(self.system, self.tracked, signals.sensor_index, self.noise)
+        follower = Problem(self.system, self.tracked, signals.sensor_index, self.noise, self.rules)
         if not follower.process_noise:
             return point, self.whole
         point, working = along_measured_motion(follower, replace(point, warm_start=()))
         followed = follower.forward(point, working.inputs).part
         force = followed.grid.inverse(followed.force) + followed.grid.monomials @ followed.force_polynomial
         force[self.split :] = signals.force[self.split :]
-        return point, transform(replace(signals, force=force), self.noise)
+        return point, transform(replace(signals, force=force), self.noise, self.rules.record)
 
     def _free_run(
         self, problem: Problem, forward: Forward, state: FloatArray, rest: FloatArray, number: int
@@ -225,18 +224,18 @@ class HeldOut:
 
     def _residuals(self, *runs: FreeRun) -> list[FloatArray]:
         """Errors of free runs, whitened by the noise through the first model, each (2 F S,)."""
-        problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise)
+        problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise, self.rules)
         whitener = Whitener.of(problem.forward(runs[0].point), self.noise)
         residuals = []
         for run in runs:
             error = run.measured - run.simulated
-            compared = np.where(self.later.differentiated, rate_of(error, self.grid), error)
+            compared = np.where(self.later.differentiated, rate_of(error, self.grid, self.rules.record), error)
             residuals.append(whitener(self.grid.forward(compared), self.later))
         return residuals
 
     def noise_rms(self, fit: Fit, noise: Noise) -> FloatArray:
         """Error that noise alone causes at each sensor: its own and that of the inputs through the model, (S,)."""
-        problem = Problem(self.system, self.whole, self.signals.sensor_index, noise)
+        problem = Problem(self.system, self.whole, self.signals.sensor_index, noise, self.rules)
         plant = problem.forward(fit.point).plant
         variance = noise.support_variance(self.whole.grid.omega)
         power = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support) ** 2, variance)
