@@ -393,6 +393,7 @@ class SensorLaw(Parametrised):
     forms: Mapping[str, SensorLaw] = field(default_factory=dict)  # other models of the same effect, by variant
     where: Where = "sensor"  # "axle": all inputs of one axle together
     stuck: bool = False  # the channel repeats its first value
+    scales_noise: bool = False  # its only parameter is the channel's noise over the noise declared
     prior_cost: float = 0.0
     fault: bool = True
     # Deviation of the only parameter in an instrument in order; None: no instrument has the fault

@@ -81,6 +81,7 @@ SENSOR_NOISE = SensorLaw(
     looks_like="white excess in one channel, without relation to any other",
     confused_with=("unknown",),
     sentence="the sensor has {ratio} times the noise declared",
+    scales_noise=True,
 )
 SENSOR_STUCK = SensorLaw(
     name="sensor_stuck",

@@ -12,12 +12,12 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from sprung.model.diagnosis.report.report import IdentifiedLaw, Report, ReportedParameter
 from sprung.model.diagnosis.response.terms import WIDER
-from sprung.model.laws import ElementLaw, SensorLaw, StructureLaw
-from sprung.model.laws.sensor_faults import SENSOR_NOISE
+from sprung.model.laws import CATALOGUE, ElementLaw, SensorLaw, StructureLaw
 from sprung.model.system import System, parse_system
 
 _DIGITS = 6
 _GROUPS = ("elements", "bodies", "inputs", "sensors")  # of a system file, whose entries have laws
+_NOISE_LAWS = {law.name for law in CATALOGUE if isinstance(law, SensorLaw) and law.scales_noise}
 QUANTITIES = ("stiffness", "damping", "mass")
 
 
@@ -60,7 +60,7 @@ def _write_laws(file: Any, system: System, report: Report) -> None:
 def _write_noise(file: Any, report: Report) -> None:
     """Noise of channels that are noisier than their peers, and of all whose level was estimated."""
     for finding in report.findings:
-        if finding.effect == SENSOR_NOISE.name and finding.parameters:
+        if finding.effect in _NOISE_LAWS and finding.parameters:
             for name in finding.location.split("|"):
                 channel = _channel(file, name)
                 if channel is not None and channel.get("noise"):
@@ -83,7 +83,7 @@ def left_out(report: Report) -> list[str]:
     Unnamed forces, and faults of the measurement set-up.
     """
     held = {(law.location, law.effect) for law in report.laws} | {
-        (finding.location, finding.effect) for finding in report.findings if finding.effect == SENSOR_NOISE.name
+        (finding.location, finding.effect) for finding in report.findings if finding.effect in _NOISE_LAWS
     }
     missing = [finding for finding in report.findings if (finding.location, finding.effect) not in held]
     return [f"{one.effect.replace('_', ' ')} at {one.location.replace('|', ' and ')}" for one in missing]

@@ -8,7 +8,7 @@ from sprung.model.diagnosis.investigation.calibration import calibration_indices
 from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import IdentifiedLaw
 from sprung.model.diagnosis.report.values import input_fault_parameter, law_parameters
-from sprung.model.laws.bodies import MASS_CHANGE
+from sprung.model.laws import BodyLaw, Law
 
 _SHOWN = 4  # in the summary
 
@@ -35,16 +35,15 @@ def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     return tuple(IdentifiedLaw(term.location, term.law.name, (parameter,)) for _, term, parameter in significant)
 
 
-def in_words(calibration: Sequence[IdentifiedLaw]) -> str:
+def in_words(calibration: Sequence[IdentifiedLaw], catalogue: Sequence[Law]) -> str:
     """Summary; empty without calibration errors."""
+    quantities = {law.name: f"{law.scales} " for law in catalogue if isinstance(law, BodyLaw) and law.scales}
     if not calibration:
         return ""
-    shown = [f"{one.location} {_name(one)} {p.words()}" for one in calibration[:_SHOWN] for p in one.parameters]
+    shown = [
+        f"{one.location} {quantities.get(one.effect, '')}{parameter.name} {parameter.words()}"
+        for one in calibration[:_SHOWN]
+        for parameter in one.parameters
+    ]
     more = f" and {len(calibration) - _SHOWN} more" if len(calibration) > _SHOWN else ""
     return f"within calibration: {', '.join(shown)}{more}"
-
-
-def _name(one: IdentifiedLaw) -> str:
-    """The wrong quantity, in a word or two."""
-    (parameter,) = one.parameters
-    return f"mass {parameter.name}" if one.effect == MASS_CHANGE.name else parameter.name

@@ -69,7 +69,7 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
         laws=_laws(outcome, calibration),
         calibration=calibration,
         noise=_noise(state),
-        summary=_summary(outcome, findings, explained, in_words(calibration)),
+        summary=_summary(outcome, findings, explained, in_words(calibration, state.system.catalogue)),
         advice=tuple(advice),
         plot_data=plot_data_of(state, before, after, judgement.floor, [(f.location, f.effect) for f in findings]),
     )
