@@ -14,10 +14,13 @@ import numpy as np
 
 from sprung.model.schema import ForceInput
 from sprung.model.system import System
+from sprung.service.monitoring.views import LETTERS
 from sprung.service.report.layout import Layout, lay_out
 
 COLUMN, GAP, MARGIN = 70.0, 46.0, 64.0  # px
 STOREY, THICKNESS, WHEEL = 112.0, 34.0, 20.0
+LETTER = 8.0  # px, of a name
+SCALED = 700.0  # px: wider drawings are scaled down on phones, where their labels have to grow
 ROW = 62.0  # of the plan
 WORDS = {  # state -> what it says in words
     "ok": "good",
@@ -50,6 +53,7 @@ class DrawingColumns:
     layout: Layout
     at: Mapping[tuple[float, float], float]  # px by (x, y)
     width: float
+    column: float = COLUMN  # px
 
     def across(self, x: float, y: float) -> float:
         """px of any place; between columns where none is just there."""
@@ -62,18 +66,23 @@ class DrawingColumns:
 def columns(system: System) -> DrawingColumns:
     """Columns of a system's elements, rearmost first; the right side before the left at the same place."""
     layout = lay_out(system)
-    places = sorted({layout.element_position(name) for name in system.elements})
+    short = short_names(system.elements)
+    above = dict[tuple[float, float], float]()  # px that the names of a place take beside each other, as in the plan
+    for name in system.elements:
+        place = layout.element_position(name)
+        above[place] = above.get(place, 0.0) + LETTER * (len(short[name]) + 1)
+    places, column = sorted(above), max(COLUMN, *above.values(), 0.0)
     xs = sorted({x for x, _ in places})
     steps = np.diff(xs)
     far = 3.0 * float(np.median(steps)) if len(steps) else np.inf
-    at, across = dict[tuple[float, float], float](), MARGIN + COLUMN / 2
+    at, across = dict[tuple[float, float], float](), MARGIN + column / 2
     before = xs[0] if xs else 0.0
     for x, y in places:
         across += GAP if x - before > far else 0.0
         at[x, y] = across
-        across += COLUMN
+        across += column
         before = x
-    return DrawingColumns(layout, at, across - COLUMN / 2 + MARGIN)
+    return DrawingColumns(layout, at, across - column / 2 + MARGIN, column)
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
@@ -99,13 +108,9 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
     parts += _ground(found, foot)
     for name in sorted(file.bodies, key=lambda body: layout.level[body]):
         parts.append(_body(found, name, tops[name]))
-    for name in system.elements:
-        item = file.elements[name]
-        ends = [tops.get(end) for end in (item.upper, item.lower)]
-        head = min((top + THICKNESS for top in ends if top is not None), default=foot - STOREY)
-        base = max((top for top in ends if top is not None), default=foot) if None not in ends else foot
-        across = found.across(*layout.element_position(name))
-        parts.append(_element(name, short[name], across, head, base, parameters))
+    spans = {name: _span(file.elements[name].upper, file.elements[name].lower, tops, foot) for name in system.elements}
+    for name, (head, base) in spans.items():
+        parts.append(_element(name, short[name], found.across(*layout.element_position(name)), head, base, parameters))
     parts += _captions(system, foot, tops)
     names = short_names(system.sensors)
     for name, sensor in file.sensors.items():
@@ -113,13 +118,27 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
         if body in tops:
             at = getattr(sensor, "position", None)
             x, y = at if at is not None else file.bodies[body].position
-            parts.append(_sensor(name, names[name], found.across(float(x), float(y)), tops[body], sensors))
+            across = found.across(float(x), float(y))
+            stands = any(
+                base == tops[body] and found.across(*layout.element_position(element)) == across
+                for element, (_, base) in spans.items()
+            )
+            across += found.column / 2 if stands else 0.0  # beside the element that stands there
+            parts.append(_sensor(name, names[name], across, tops[body], sensors))
         else:
             element = getattr(sensor, "element", None)
             if element in file.elements:
-                across = found.across(*layout.element_position(element)) + COLUMN / 2 - 6
-                parts.append(_sensor(name, names[name], across, foot - STOREY / 2, sensors))
+                across = found.across(*layout.element_position(element)) + found.column / 2
+                parts.append(_sensor(name, names[name], across, sum(spans[element]) / 2, sensors))
     return "".join([*parts, "</svg>"])
+
+
+def _span(upper: str, lower: str, tops: Mapping[str, float], foot: float) -> tuple[float, float]:
+    """px of an element's upper and lower end."""
+    ends = [tops.get(end) for end in (upper, lower)]
+    head = min((top + THICKNESS for top in ends if top is not None), default=foot - STOREY)
+    base = max((top for top in ends if top is not None), default=foot) if None not in ends else foot
+    return head, base
 
 
 def plan_view(system: System, parameters: Mapping[str, Mark]) -> str:
@@ -137,9 +156,11 @@ def plan_view(system: System, parameters: Mapping[str, Mark]) -> str:
         parts.append(f'<line class="rail" x1="{MARGIN / 2}" x2="{found.width - 8}" y1="{row}" y2="{row}"/>')
         parts.append(f'<text class="caption" x="4" y="{row - 8}">{side}</text>')
     for (x, y), names in places.items():
-        for number, name in enumerate(names):
+        sizes = [LETTER * (len(short[name]) + 1) for name in names]
+        starts = found.across(x, y) - sum(sizes) / 2 + np.cumsum([0.0, *sizes[:-1]])
+        for name, start, size in zip(names, starts, sizes, strict=True):
             mark = worst(parameters.get(f"{name}.{q}") for q in ("stiffness", "damping"))
-            across = found.across(x, y) + 18.0 * number
+            across = start + size / 2
             parts.append(
                 f'<a href="#{escape(name)}" data-element="{escape(name)}"><title>{escape(mark.words(name))}</title>'
                 f'<circle class="dot {mark.state}" cx="{across:.1f}" cy="{rows[y]:.1f}" r="11"/>'
@@ -156,7 +177,8 @@ def small_view(system: System, found: DrawingColumns, letters: str) -> str:
     caption = f"changed: {', '.join(bad)}" if bad else "no element has changed"
     width, height = 120.0, 8.0 + 12.0 * len(sides)
     parts = [f'<svg class="small" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(caption)}">']
-    for name, letter in zip(system.elements, letters, strict=False):
+    lettered = zip(system.elements, letters, strict=False)
+    for name, letter in sorted(lettered, key=lambda pair: LETTERS.find(pair[1])):  # the worst of a place is seen
         x, y = found.layout.element_position(name)
         across = 6 + (found.across(x, y) / found.width) * (width - 12)
         row = 8 + 12 * sides.index(y)
@@ -171,8 +193,9 @@ def worst(marks: Iterable[Mark | None]) -> Mark:
 
 
 def _open(width: float, height: float, label: str) -> str:
+    kind = "vehicle wide" if width > SCALED else "vehicle"
     return (
-        f'<svg class="vehicle" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" height="{height:.0f}" '
+        f'<svg class="{kind}" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" height="{height:.0f}" '
         f'role="group" aria-label="{escape(label)}">'
     )
 
@@ -184,8 +207,10 @@ def _body(found: DrawingColumns, name: str, top: float) -> str:
         for element, item in layout.system.file.elements.items()
         if name in (item.upper, item.lower)
     ]
-    left = min(own, default=found.width / 2) - COLUMN / 2 + 4
-    right = max(own, default=found.width / 2) + COLUMN / 2 - 4
+    left = min(own, default=found.width / 2) - found.column / 2 + 4
+    right = max(own, default=found.width / 2) + found.column / 2 - 4
+    missing = max(LETTER * (len(name) + 1) + 8 - (right - left), 0.0)  # px for the whole name
+    left, right = left - missing / 2, right + missing / 2
     return (
         f'<rect class="body" x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{THICKNESS}" rx="5"/>'
         f'<text class="bodyname" x="{left + 8:.1f}" y="{top + 22:.1f}">{escape(name)}</text>'

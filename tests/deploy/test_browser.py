@@ -169,10 +169,10 @@ def test_where_a_vehicle_stood_no_line_is_drawn(served: tuple[str, Core], browse
     core.pipeline.process("car-21", [make_window(system, i, level) for i, level in enumerate(levels)])
     page = browser.new_page(viewport={"width": 1400, "height": 900})
     page.goto(address + PAGES["vehicle"])
-    page.wait_for_function("document.querySelector('#shown').textContent.includes('points')")
+    page.locator("#shown", has_text="points").wait_for()
     assert not page.locator("#stood").is_visible()
     page.goto(f"{address}/pages/vehicles/car-21")
-    page.wait_for_function("document.querySelector('#shown').textContent.includes('points')")
+    page.locator("#shown", has_text="points").wait_for()
     assert "standing" in page.inner_text("#stood")
     pixels = """() => { const c = document.querySelector('#plot canvas'), x = c.getContext('2d');
         const o = document.querySelector('#plot .u-over').getBoundingClientRect(), b = c.getBoundingClientRect();
@@ -188,6 +188,31 @@ def test_where_a_vehicle_stood_no_line_is_drawn(served: tuple[str, Core], browse
     kept(page, "standing")
     page.close()
     core.operations.remove("test", "car-21")
+
+
+def test_rides_of_seconds_are_seen_in_a_history_of_days(served: tuple[str, Core], browser: Any, system: System) -> None:
+    address, core = served
+    for begin in (0, 691_200):  # windows, half a second each: four days
+        core.pipeline.process("car-22", [make_window(system, begin + i) for i in range(80)])
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.add_init_script(NOTED)
+    page.goto(f"{address}/pages/vehicles/car-22")
+    page.locator("#shown", has_text="160 points").wait_for()
+    page.wait_for_timeout(500)
+    blue = """() => { const c = document.querySelector('#plot canvas'), o = document.querySelector('#plot .u-over');
+        const p = o.getBoundingClientRect(), b = c.getBoundingClientRect(), ratio = c.width / b.width;
+        const wanted = getComputedStyle(document.documentElement).getPropertyValue('--blue').trim();
+        const rgb = [1, 3, 5].map((i) => parseInt(wanted.slice(i, i + 2), 16));
+        return [0, 1].map((share) => { const d = c.getContext('2d').getImageData(
+            ratio * (p.left - b.left + share * p.width - 5), ratio * (p.top - b.top), 10 * ratio, ratio * p.height);
+            let n = 0;
+            for (let i = 0; i < d.data.length; i += 4) n += rgb.every((v, k) => Math.abs(v - d.data[i + k]) < 40);
+            return n; }); }"""
+    assert min(page.evaluate(blue)) > 12
+    assert "%" in page.evaluate("window.written")
+    kept(page, "rides")
+    page.close()
+    core.operations.remove("test", "car-22")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -261,10 +286,11 @@ def test_a_history_is_laid_beside_its_twins_and_zoomed_down_to_single_windows(ad
 
 
 # notes where times are written on canvases: from the top, from the left, to
-NOTED = """(() => { const real = CanvasRenderingContext2D.prototype.fillText; window.labels = [];
+NOTED = """(() => { const real = CanvasRenderingContext2D.prototype.fillText; window.labels = []; window.written = [];
     CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
         const at = this.getTransform(), width = this.measureText(text).width;
         const left = at.e + x - (this.textAlign === "center" ? width / 2 : 0);
+        window.written.push(text);
         if (/[0-9]:|-[0-9]/.test(text)) window.labels.push([Math.round(at.f + y), left, left + width]);
         real.call(this, text, x, y); }; })()"""
 
@@ -341,6 +367,8 @@ def test_axe_finds_nothing_serious_in_the_description_of_the_api(address: str, b
     page.locator(".opblock-body").first.wait_for()
     page.wait_for_timeout(500)
     assert page.locator("main").count() == 1
+    names = page.evaluate("[...document.querySelectorAll('button.expand-operation')].map(e => e.ariaLabel)")
+    assert len(set(names)) == len(names) > 3 and all(name.startswith("Operations of ") for name in names)
     assert serious(page) == [] and page.locator("h1.title").get_attribute("aria-level") == "2"
     context.close()
 

@@ -11,6 +11,7 @@ const named = {
   "h1.title": () => ({ "aria-level": "2" }), // below the page's own
   "table.responses-table": (e) => ({ "aria-label": `Answers of ${operationOf(e)}` }),
   "select:not([aria-label])": (e) => ({ "aria-label": nameOf(e) }),
+  ".opblock-tag .expand-operation": (e) => ({ "aria-label": `Operations of ${e.closest(".opblock-tag").dataset.tag}` }),
   "textarea:not([aria-label])": (e) => ({ "aria-label": nameOf(e) }),
   "input:not([aria-label])": (e) => ({ "aria-label": nameOf(e) }),
   "pre:not([tabindex])": () => ({ tabindex: "0" }),

@@ -113,11 +113,33 @@
     return times.map((t, i) => t.slice(...upper) + (below[i] && `\n${below[i]}`));
   }
 
-  const axes = (clock = true) => {
+  const LABEL = 18; // px, of an axis's unit
+  const axes = (clock = true, unit = "") => {
     const grid = { stroke: style("--line"), width: 1 };
     const across = { stroke: style("--soft"), grid, ticks: grid };
-    return [clock ? { ...across, values: dates } : across, { stroke: style("--soft"), grid, ticks: grid, size: 70 }];
+    const up = { stroke: style("--soft"), grid, ticks: grid, size: 70 };
+    if (!clock) return [across, up];
+    const numbers = at("scale").value === "percent" ? 54 : 70; // plots below each other begin at the same place
+    const named = unit ? { size: numbers, label: unit, labelSize: LABEL } : { size: numbers + LABEL };
+    return [{ ...across, values: dates }, { ...up, ...named }];
   };
+
+  // indices of points that a line would hide: a ride of minutes is a pixel or two of a history of days
+  const NARROW = 6; // px
+  function lonely(u, index) {
+    const [xs, ys] = [u.data[0], u.data[index]];
+    const found = [];
+    let run = [];
+    for (let i = 0; i <= xs.length; i++) {
+      if (i < xs.length && ys[i] !== null) {
+        run.push(i);
+        continue;
+      }
+      if (run.length && u.valToPos(xs[run.at(-1)], "x") - u.valToPos(xs[run[0]], "x") < NARROW) found.push(...run);
+      run = [];
+    }
+    return found;
+  }
 
   const hold = (answer) => Math.max(answer.resolution, data.hop); // s that a point stands for
 
@@ -150,7 +172,7 @@
     shown.forEach((s, i) => {
       const colour = style(COLOURS[i % COLOURS.length]);
       const text = (_, v) => (v === null || v === undefined ? "–" : `${Number(v).toPrecision(4)} ${s.unit}`);
-      series.push({ label: s.name, stroke: colour, width: 2, value: text, points: { show: time.length < 60 } });
+      series.push({ label: s.name, stroke: colour, width: 2, value: text, points: time.length < 60 ? {} : { show: true, size: NARROW, fill: colour, filter: lonely } });
       series.push({ label: "upper", stroke: "transparent", points: { show: false }, value: text });
       series.push({ label: "lower", stroke: "transparent", points: { show: false }, value: text });
       bands.push({ series: [3 * i + 2, 3 * i + 3], fill: i ? "transparent" : style("--band") });
@@ -166,7 +188,7 @@
     };
     const cursor = { sync, drag: { x: true, y: false, setScale: false } };
     const scales = range ? { x: { min: range[0], max: range[1] } } : {};
-    plots = [new uPlot({ width, height: 320, series, bands, hooks, cursor, scales, tzDate: utc, axes: axes() }, columns.slice(0, -1), at("plot"))];
+    plots = [new uPlot({ width, height: 320, series, bands, hooks, cursor, scales, tzDate: utc, axes: axes(true, shown[0].unit) }, columns.slice(0, -1), at("plot"))];
     const lower = { label: "windows a point", stroke: style("--soft"), fill: style("--band"), paths: uPlot.paths.bars({ size: [1, 30] }) };
     plots.push(new uPlot({ width, height: 130, series: [series[0], lower], cursor, scales: { ...scales, y: { range: (_, low, most) => [0, Math.max(most, 1)] } }, tzDate: utc, axes: axes() }, [columns[0], columns.at(-1)], at("lower")));
     plots.forEach((plot) => plot.over.addEventListener("dblclick", () => { range = null; load(); }));
@@ -195,8 +217,8 @@
       const colour = style(COLOURS[i % COLOURS.length]);
       return { label: name, scale: unit, stroke: colour, width: 2, value, dash: i ? [6, 3] : [], points: { show: time.length < 60 } };
     });
-    const [across, up] = axes();
-    const beside = units.map((unit, i) => ({ ...up, scale: unit, side: i ? 1 : 3, label: written(unit), labelSize: 18, grid: { show: !i } }));
+    const [across] = axes();
+    const beside = units.map((unit, i) => ({ ...axes(true, written(unit))[1], scale: unit, side: i ? 1 : 3, grid: { show: !i } }));
     const clock = { label: "time", value: (_, v) => (v === null ? "–" : new Date(v * 1e3).toISOString().slice(0, 16).replace("T", " ")) };
     const options = { width: at("plot").clientWidth, height: 170, series: [clock, ...series], axes: [across, ...beside], tzDate: utc };
     const cursor = { sync, drag: { x: false, y: false } };

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from sprung.service.api import signals
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.monitoring.engine import Engine
-from sprung.service.rendering.drawing import Mark, plan_view, side_view
+from sprung.service.rendering.drawing import Mark, columns, plan_view, side_view, small_view
 from sprung.service.settings import Settings
 from sprung.service.store import retention, work
 from sprung.service.store.schema import audit, metadata
@@ -336,3 +337,34 @@ def test_a_test_rig_is_not_drawn_as_a_railway_vehicle(system: System) -> None:
     assert 'class="wheel"' not in drawn and 'class="table"' in drawn
     assert side_view(system, {}, {}).count('class="wheel"') == 8
     assert "strut: not estimated" not in plan_view(rig, {"strut.stiffness": Mark("ok")})
+
+
+QUARTER = (Path(__file__).parents[3] / "docs" / "tutorial.md").read_text().split("`quarter.yaml`:\n\n```yaml\n")[1]
+
+
+def places(drawn: str, kind: str) -> dict[str, tuple[float, float]]:
+    """px by what is written there in texts of one class."""
+    found = re.findall(rf'<text class="{kind}" x="([\d.]+)" y="([\d.]+)">(\w+)<', drawn)
+    return {name: (float(x), float(y)) for x, y, name in found}
+
+
+def test_what_stands_above_each_other_hides_no_name(system: System) -> None:
+    quarter = parse_system(QUARTER.split("```")[0])
+    drawn, plan = side_view(quarter, {}, {}), plan_view(quarter, {})
+    names, bodies, sensors = (places(drawn, kind) for kind in ("name", "bodyname", "sensorname"))
+    assert bodies["sprung"][1] < sensors["travel"][1] < bodies["unsprung"][1]  # beside the strut that it measures
+    assert sensors["travel"][0] > names["strut"][0] + 30 < sensors["wheel"][0]  # clear of spring and damper
+    assert sensors["body"][0] == names["strut"][0]
+    above = places(plan, "name")
+    assert above["strut"][0] - above["tyre"][0] > 7 * (len("strut") + len("tyre")) / 2
+    box = re.search(
+        r'<rect class="body" x="([\d.]+)"[^>]*width="([\d.]+)"[^>]*/><text class="bodyname" x="([\d.]+)', drawn
+    )
+    assert box is not None and float(box[1]) + float(box[2]) > float(box[3]) + 7 * len("unsprung")
+    assert 'class="vehicle wide"' in side_view(system, {}, {}) and 'class="vehicle wide"' not in drawn
+
+
+@pytest.mark.parametrize("letters", ["ao", "oa"])
+def test_the_worst_of_a_place_is_seen_in_the_list(letters: str) -> None:
+    quarter = parse_system(QUARTER.split("```")[0])
+    assert re.findall(r'"dot (\w+)"', small_view(quarter, columns(quarter), letters)) == ["ok", "alarm"]
