@@ -233,27 +233,13 @@ class Refiner:
         wanted: Tensor,
         excitation: FloatArray,
     ) -> Refined:
-        left = (wanted[rows] & ~progress.weighed[rows]).nonzero().squeeze(1)
-        if len(left):  # did not converge: where it stands is as good a point as any to ask what is wrong
-            chosen, x = data.take(left), progress.x[rows[left]]
-            at = self.model.linearise(x, chosen)
-            everything = torch.arange(len(left))
-            self._weigh(everything, at, self.model.chord(at, x, at.x0, chosen), chosen, progress, rows[left])
+        self._weigh_unconverged(data, progress, rows, wanted)
         x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
-        std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
-        identifiable = std < IDENTIFIABLE_STD
-        noise, weak = np.zeros(len(x)), (std > WEAK_STD).any(dim=1).nonzero().squeeze(1)
-        if len(weak):
-            chosen = data.take(weak)
-            share = noise_share(self.model, self.model.linearise(x[weak], chosen), chosen)
-            P = len(self.system.parameters)
-            noise[weak.numpy()] = mean_share(share[:, :P])
-            vague = (std[weak, P:] > WEAK_STD).any(dim=1) & (share[:, :P].mean(dim=1) > VAGUE_SHARE)
-            identifiable[weak] &= (share < NOISE_SHARE) & ~(vague[:, None] & (std[weak] > WEAK_STD))
+        identifiable, noise = self._identifiable(data, x, torch.diagonal(covariance, dim1=1, dim2=2).sqrt())
         signals = len(self.model.compression.matrix(data.present))
         freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
-        # What the model cannot follow is treated as more noise, so that intervals stay honest.
+        # What the model cannot follow is treated as more noise: intervals keep their coverage.
         covariance = covariance * chi_square.clamp_min(1)[:, None, None]
         both = identifiable[:, :, None] & identifiable[:, None, :]
         prior = torch.diag(1 / self.model.precision[: x.shape[1]])
@@ -281,6 +267,31 @@ class Refiner:
             diverged=np.zeros(len(x), dtype=bool),
             ended=np.zeros(len(x), dtype=bool),
         )
+
+    def _weigh_unconverged(self, data: WindowBatch, progress: _Progress, rows: Tensor, wanted: Tensor) -> None:
+        """Evidence on deviations of windows that did not converge, at their last iterate."""
+        left = (wanted[rows] & ~progress.weighed[rows]).nonzero().squeeze(1)
+        if len(left):
+            chosen, x = data.take(left), progress.x[rows[left]]
+            at = self.model.linearise(x, chosen)
+            everything = torch.arange(len(left))
+            self._weigh(everything, at, self.model.chord(at, x, at.x0, chosen), chosen, progress, rows[left])
+
+    def _identifiable(self, data: WindowBatch, x: Tensor, std: Tensor) -> tuple[Tensor, FloatArray]:
+        """Which log-ratios x (B, P) with deviations std are identifiable, (B, P), and the windows' noise share, (B,).
+
+        The share of the inputs' noise in the information is computed for windows with any weak parameter only.
+        """
+        identifiable = std < IDENTIFIABLE_STD
+        noise, weak = np.zeros(len(x)), (std > WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        if len(weak):
+            chosen = data.take(weak)
+            share = noise_share(self.model, self.model.linearise(x[weak], chosen), chosen)
+            P = len(self.system.parameters)
+            noise[weak.numpy()] = mean_share(share[:, :P])
+            vague = (std[weak, P:] > WEAK_STD).any(dim=1) & (share[:, :P].mean(dim=1) > VAGUE_SHARE)
+            identifiable[weak] &= (share < NOISE_SHARE) & ~(vague[:, None] & (std[weak] > WEAK_STD))
+        return identifiable, noise
 
 
 @dataclass(frozen=True, slots=True)

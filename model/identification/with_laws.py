@@ -7,7 +7,9 @@ logarithms of ratios to the file, the loads where they are asked for, and the me
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -100,7 +102,7 @@ class LawRefiner:
         present: BoolArray = ~np.asarray(np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1))
         model = self._with(loads)
 
-        def work(at: IntArray) -> Refined:
+        def search(at: IntArray, near: bool) -> Refined:
             # forces that leave all bounds are reported as such
             with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
                 data = self.model.batch(self.model.knots(windows[at]), windows[at], present[at[0]])
@@ -109,36 +111,53 @@ class LawRefiner:
                 found = search.run(states, near, iterations)
                 return replace(found, excitation=self.model.excitation(windows[at]))
 
-        def over(of: IntArray) -> Refined:
-            pieces = [
-                np.asarray(part)
-                for group in alike(present, of)
-                for part in np.array_split(group, max(1, -(-len(group) * len(self.laws) // _CHUNK)))
-            ]
-            return in_order(share(work, pieces, self.workers), np.concatenate(pieces))
+        def refined(of: IntArray, near: bool) -> Refined:
+            pieces = self._pieces(present, of)
+            return in_order(share(partial(search, near=near), pieces, self.workers), np.concatenate(pieces))
 
-        near = start is not None
-        everything = np.arange(len(windows))
-        if near or len(windows) < _MANY:
-            found = over(everything)
-        else:  # pilot windows start the others
-            pilots = np.linspace(0, len(windows) - 1, _PILOT_WINDOWS).astype(int)
-            others = np.setdiff1d(everything, pilots)
-            first = over(pilots)
-            near = _start_from_well_fitted(begin, others, first, P)
-            found = in_order([first, over(others)], np.concatenate([pilots, others]))
-        bad = np.flatnonzero(~_well_fitted(found))
-        near = _start_from_well_fitted(begin, bad, found, P)
-        if len(bad) and near:
-            again = over(bad)
-            better = again.chi_square < found.chi_square[bad]
-            found = found.replaced(bad[better], again.take(np.flatnonzero(better)))
-        return found
+        if start is not None or len(windows) < _MANY:
+            found = refined(np.arange(len(windows)), start is not None)
+        else:
+            found = _from_pilots(begin, refined, P)
+        return _badly_fitted_again(begin, found, refined, P)
+
+    def _pieces(self, present: BoolArray, of: IntArray) -> list[IntArray]:
+        """Windows `of` in pieces with the same sensors that fit into memory; present: of each window, (B, S)."""
+        return [
+            np.asarray(part)
+            for group in alike(present, of)
+            for part in np.array_split(group, max(1, -(-len(group) * len(self.laws) // _CHUNK)))
+        ]
 
     def _with(self, loads: bool) -> LawWindows:
         if loads not in self._windows:
             self._windows[loads] = LawWindows(self.model.system, self.laws, self.model, loads)
         return self._windows[loads]
+
+
+def _from_pilots(begin: FloatArray, refined: Callable[[IntArray, bool], Refined], P: int) -> Refined:
+    """All windows, of which a few pilots determine where the others start, in rows of `begin` (B, P).
+
+    refined: the refinement of some windows, and whether they start near.
+    """
+    everything = np.arange(len(begin))
+    pilots = np.linspace(0, len(begin) - 1, _PILOT_WINDOWS).astype(int)
+    others = np.setdiff1d(everything, pilots)
+    first = refined(pilots, False)
+    near = _start_from_well_fitted(begin, others, first, P)
+    return in_order([first, refined(others, near)], np.concatenate([pilots, others]))
+
+
+def _badly_fitted_again(
+    begin: FloatArray, found: Refined, refined: Callable[[IntArray, bool], Refined], P: int
+) -> Refined:
+    """Windows that do not fit started again from those that do; the better result of each."""
+    bad = np.flatnonzero(~_well_fitted(found))
+    if not _start_from_well_fitted(begin, bad, found, P) or not len(bad):
+        return found
+    again = refined(bad, True)
+    better = again.chi_square < found.chi_square[bad]
+    return found.replaced(bad[better], again.take(np.flatnonzero(better)))
 
 
 def _well_fitted(found: Refined) -> BoolArray:

@@ -21,6 +21,7 @@ from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.alarms import HARD_FAULT_WINDOWS, Attribution, LoadLimit, counted
 from sprung.model.tracking.deviation_model import model_of as deviation_model
+from sprung.model.tracking.deviations import Jump
 from sprung.model.tracking.fusion import KNOWN, Fusion, nanoseconds
 from sprung.model.tracking.reports import ParameterLike, ParameterReport, health_of, reported
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
@@ -130,30 +131,40 @@ class Tracker:
         curving = conditions is not None and conditions.curving and not estimate.adequate
         if curving or not estimate.informative:
             return self._skipped(state, estimate, time_ns, centre, conditions)
-        stuck = _stuck(state, estimate, centre)
-        usable = estimate.adequate and estimate.converged
+        new, jump = self._fused(state, estimate, time_ns, centre, conditions)
+        new = self._with_misfit(new, estimate, centre)
+        seen = coverage.update(state.coverage, usable=new.used > state.used)
+        new = replace(new, time=time_ns, stuck=_stuck(state, estimate, centre), coverage=seen)
+        jump = jump if self._fusion.armed(state) else None
+        return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), jump, centre))
+
+    def _fused(
+        self, state: TrackerState, estimate: Estimate, time_ns: int, centre: int, conditions: Conditions | None
+    ) -> tuple[TrackerState, Jump | None]:
+        """State with a window, and a deviation that has jumped; the window is counted as rejected if it is unusable."""
         mask = estimate.identifiable & np.isfinite(estimate.log_ratio)
-        new, jump = replace(state, rejected=state.rejected + 1), None
-        if (
-            usable
+        usable = (
+            _is_usable(estimate)
             and mask.any()
             and not self._fusion.effects.too_large(state, estimate)
             and is_covariance(estimate.covariance if mask.all() else estimate.covariance[mask][:, mask])
-        ):
-            new, jump = self._fusion.fuse(state, estimate, mask, time_ns, centre, conditions)
-        if usable or not estimate.faults:  # an identified sensor fault is no misfit of the model
-            fit = misfit.update(
-                state.fit,
-                self._fusion.effects.chi_square(new, estimate),
-                adequate=estimate.adequate,
-                inflation=float(new.inflation.factor.max()),
-                time=centre,
-            )
-            new = replace(new, fit=fit)
-        seen = coverage.update(state.coverage, usable=new.used > state.used)
-        new = replace(new, time=time_ns, stuck=stuck, coverage=seen)
-        jump = jump if self._fusion.armed(state) else None
-        return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), jump, centre))
+        )
+        if not usable:
+            return replace(state, rejected=state.rejected + 1), None
+        return self._fusion.fuse(state, estimate, mask, time_ns, centre, conditions)
+
+    def _with_misfit(self, state: TrackerState, estimate: Estimate, centre: int) -> TrackerState:
+        """State with the misfit of a window, unless the window is unusable because of an identified sensor fault."""
+        if estimate.faults and not _is_usable(estimate):
+            return state
+        fit = misfit.update(
+            state.fit,
+            self._fusion.effects.chi_square(state, estimate),
+            adequate=estimate.adequate,
+            inflation=float(state.inflation.factor.max()),
+            time=centre,
+        )
+        return replace(state, fit=fit)
 
     def _skipped(
         self, state: TrackerState, estimate: Estimate, time_ns: int, centre: int, conditions: Conditions | None
@@ -356,6 +367,10 @@ class Tracker:
             return None
         idle = (state.time - state.last) * 1e-9 - self.settings.window
         return state.last if idle > dev.STOPPED else None
+
+
+def _is_usable(estimate: Estimate) -> bool:
+    return estimate.adequate and estimate.converged
 
 
 def _stuck(state: TrackerState, estimate: Estimate, centre: int) -> tuple[Stuck, ...]:

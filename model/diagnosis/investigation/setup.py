@@ -60,13 +60,12 @@ def without_setup_faults(
     rules = problem.rules.setup
     while len(found) < rules.most and float(np.max(present)) > rules.misfit:
         best = _best(system, signals, declared, split, problem, fit, present)
-        if best is None or _misfit_with_missing_part(problem, fit, best[0].after) < rules.outdone * best[0].after:
+        if best is None or _misfit_with_missing_part(problem, fit, best.fault.after) < rules.outdone * best.fault.after:
             break
-        fault, system, corrected, problem, fit = best
-        split, signals = fitted_samples(signals, corrected, split), corrected
-        if any(fault.site.location == known.site.location for known in found):
+        system, signals, split, problem, fit = best.system, best.signals, best.split, best.problem, best.fit
+        if any(best.fault.site.location == known.site.location for known in found):
             break
-        found.append(fault)
+        found.append(best.fault)
         present = misfit(fit)
     return system, signals, tuple(found)
 
@@ -112,7 +111,16 @@ def misfit(fit: Fit) -> FloatArray:
     return relative(fit.spectrum[part.grid.band][1:], part.sensors[part.grid.band][1:])
 
 
-_Accepted = tuple[SetupFault, System, Signals, Problem, Fit]
+@dataclass(frozen=True)
+class _FittedFault:
+    """A fault of the set-up with the structure fitted beside it."""
+
+    fault: SetupFault
+    system: System  # corrected for it
+    signals: Signals  # likewise
+    split: int  # number of fitted samples
+    problem: Problem
+    fit: Fit
 
 
 def _best(
@@ -123,41 +131,56 @@ def _best(
     problem: Problem,
     fit: Fit,
     present: FloatArray,
-) -> _Accepted | None:
+) -> _FittedFault | None:
     """The fitted hypothesis that explains most, if one explains enough."""
-    rules = problem.rules.setup
-    total = float(np.sum(present))
-    accepted: list[_Accepted] = []
-    refined: dict[int, _Accepted] = {}  # by the identity of the accepted one
+    rules, total = problem.rules.setup, float(np.sum(present))
+    accepted: list[_FittedFault] = []
+    refined: dict[int, _FittedFault] = {}  # by the identity of the accepted one
     for ranked in _ranked(system, signals, problem, fit, total):
         for hypothesis in _best_on_a_stretch(ranked, system, signals, declared, problem):
             if problem.worked_out:
                 return None
-            changed, corrected = hypothesis.undo(system, signals)
-            try:
-                fitted = fitted_samples(signals, corrected, split)
-                other, again = _fitted(changed, corrected, declared, fitted, problem)
-            except DiagnosisError:
+            one = _tried(hypothesis, system, signals, declared, split, problem, total)
+            if one is not None and hypothesis is ranked[0] and one.fault.after >= rules.explains * total:
+                one = _refined(one, declared)  # its value was read beside parameters that had absorbed part
+            if one is None or one.fault.after >= rules.explains * total:
                 continue
-            remaining = total_misfit(again)
-            one = _fault(hypothesis, total, remaining), changed, corrected, other, again
-            if rules.explains * total <= remaining < rules.promising * total and hypothesis is ranked[0]:
-                one = _refined(one, declared, fitted)  # its value was read beside parameters that had absorbed part
-            if one[0].after < rules.explains * total:
-                if hypothesis.by_mass:  # independent of stiffnesses, which absorb part of the others
-                    return _refined(one, declared, fitted)
-                accepted.append(one)
+            if hypothesis.by_mass:  # independent of stiffnesses, which absorb part of the others
+                return _refined(one, declared)
+            accepted.append(one)
         accepted.sort(key=_after)
         rivals = _rivals(accepted, rules.rivals)
-        if all(one[0].effect.ordinary for one in rivals):
+        if all(one.fault.effect.ordinary for one in rivals):
             continue
         for one in rivals:
             if id(one) not in refined:
-                refined[id(one)] = _refined(one, declared, fitted_samples(signals, one[2], split))
+                refined[id(one)] = _refined(one, declared)
         best = min((refined[id(one)] for one in rivals), key=_after)
-        if not best[0].effect.ordinary:
+        if not best.fault.effect.ordinary:
             return best
     return None  # a fault of one sensor is screened with the laws and validated on the held-out part
+
+
+def _tried(
+    hypothesis: Hypothesis,
+    system: System,
+    signals: Signals,
+    declared: Noise,
+    split: int,
+    problem: Problem,
+    total: float,
+) -> _FittedFault | None:
+    """A hypothesis fitted; None if it diverges, or leaves more of the misfit `total` than spectra promise of any."""
+    changed, corrected = hypothesis.undo(system, signals)
+    split = fitted_samples(signals, corrected, split)
+    try:
+        other, fit = _fitted(changed, corrected, declared, split, problem)
+    except DiagnosisError:
+        return None
+    remaining = total_misfit(fit)
+    if remaining >= problem.rules.setup.promising * total:
+        return None
+    return _FittedFault(_fault(hypothesis, total, remaining), changed, corrected, split, other, fit)
 
 
 def _best_on_a_stretch(
@@ -191,19 +214,19 @@ def _best_on_a_stretch(
     return [ranked[number] for number in sorted(number for _, number in good)]
 
 
-def _rivals(accepted: list[_Accepted], most: int) -> list[_Accepted]:
+def _rivals(accepted: list[_FittedFault], most: int) -> list[_FittedFault]:
     """Accepted hypotheses, least misfit first, that are compared after a refined estimate.
 
     Other faults of the channel with the best gain or lag are included: rough values do not rank these reliably.
     """
-    if not accepted or not accepted[0][0].effect.ordinary:
+    if not accepted or not accepted[0].fault.effect.ordinary:
         return accepted[:1]
     first = accepted[0]
-    return [one for one in accepted if one[0].site.location == first[0].site.location][:most]
+    return [one for one in accepted if one.fault.site.location == first.fault.site.location][:most]
 
 
-def _after(accepted: _Accepted) -> float:
-    return accepted[0].after
+def _after(accepted: _FittedFault) -> float:
+    return accepted.fault.after
 
 
 def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total: float) -> Iterator[list[Hypothesis]]:
@@ -264,24 +287,26 @@ def _fitted(system: System, signals: Signals, declared: Noise, split: int, like:
     return baseline(system, signals, declared, split, like.rules, like.memory, like.work, roughly=_rough(like))
 
 
-def _refined(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
+def _refined(accepted: _FittedFault, declared: Noise) -> _FittedFault:
     """A delay, scale or position refined on the structure fitted without it, which had absorbed part of it."""
-    fault, system, signals, problem, fit = accepted
-    if _rough(problem):
-        problem, fit = refreshed(problem, fit)
-        fault = replace(fault, after=total_misfit(fit))
-        accepted = fault, system, signals, problem, fit
-    effect = fault.effect
-    if fault.value is None or effect.remaining is None:
+    if _rough(accepted.problem):
+        problem, fit = refreshed(accepted.problem, accepted.fit)
+        fault = replace(accepted.fault, after=total_misfit(fit))
+        accepted = replace(accepted, fault=fault, problem=problem, fit=fit)
+    effect, value, std = accepted.fault.effect, accepted.fault.value, accepted.fault.std
+    if value is None or effect.remaining is None:
         return accepted
-    rules, value, std = problem.rules, fault.value, fault.std
-    for _ in range(rules.setup.rounds):
-        weighing = CorrectedFit(SetupScores(problem, fit), ModelResponse.of(problem, fit.forward), system)
-        found, unit = effect.remaining(fault.site, weighing)
+    for _ in range(accepted.problem.rules.setup.rounds):
+        system, problem = accepted.system, accepted.problem
+        weighing = CorrectedFit(
+            SetupScores(problem, accepted.fit), ModelResponse.of(problem, accepted.fit.forward), system
+        )
+        found, unit = effect.remaining(accepted.fault.site, weighing)
         change, std = found.amount * unit, found.std * unit
         value = effect.further(value, change)
-        system, corrected = effect.remainder(fault.site, change)(system, signals)
-        split, signals = fitted_samples(signals, corrected, split), corrected
+        system, signals = effect.remainder(accepted.fault.site, change)(system, accepted.signals)
+        split = fitted_samples(accepted.signals, signals, accepted.split)
         problem, fit = baseline(system, signals, declared, split, problem.rules, problem.memory, problem.work)
+        accepted = _FittedFault(accepted.fault, system, signals, split, problem, fit)
     std *= value if effect.relative else 1.0
-    return replace(fault, value=value, std=std, after=total_misfit(fit)), system, signals, problem, fit
+    return replace(accepted, fault=replace(accepted.fault, value=value, std=std, after=total_misfit(accepted.fit)))
