@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper,
 from sprung.model.signals import FloatArray
 
 _At = tuple[FloatArray, FloatArray, float]  # deflection, rate, time
+_Rate = Callable[[int, FloatArray], FloatArray]  # of a sample, and the states there
 _SERIES = 0.5  # below this the recursion for phi loses digits and the power series takes over
 
 
@@ -84,13 +86,7 @@ def recall(
     path[0] = law.memory_start(Motion(d[0], v[0], time[0]), p, element) if first is None else first
     if law.memory_rates and not law.memory_decay:
         node, half = law.memory_rates(Motion(d, v, time), p), law.memory_rates(Motion(d_half, v_half, time[1:]), p)
-        for i in range(len(time) - 1):
-            z = path[i]
-            n0 = node(i, z)
-            na = half(i, z + h / 2 * n0)
-            nb = half(i, z + h / 2 * na)
-            path[i + 1] = z + h / 6 * (n0 + 2 * (na + nb) + node(i + 1, z + h * nb))
-        return np.moveaxis(path, 0, -1)
+        return np.moveaxis(_runge_kutta(path, node, half, h), 0, -1)
     if law.memory_decay:
         clock = time.reshape(-1, *(1 for _ in shape))
         between = Motion(d_half, v_half, clock[:-1] + h / 2)
@@ -100,6 +96,20 @@ def recall(
         middle = d_half[i], v_half[i], t + h / 2
         path[i + 1] = step.advance(path[i], (d[i], v[i], t), middle, (d[i + 1], v[i + 1], t + h))
     return np.moveaxis(path, 0, -1)
+
+
+def _runge_kutta(path: FloatArray, node: _Rate, half: _Rate, h: float) -> FloatArray:
+    """States (T, memory, ...) from the first on, by the classical method with one step per sample.
+
+    node, half: rates of the states (memory, ...) at a sample, and in the middle of the step that begins there.
+    """
+    for i in range(len(path) - 1):
+        z = path[i]
+        n0 = node(i, z)
+        na = half(i, z + h / 2 * n0)
+        nb = half(i, z + h / 2 * na)
+        path[i + 1] = z + h / 6 * (n0 + 2 * (na + nb) + node(i + 1, z + h * nb))
+    return path
 
 
 class MemoryStep:

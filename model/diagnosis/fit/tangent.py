@@ -70,20 +70,39 @@ def port_motions(
     result[1, :, :, : P + p] = grid.inverse(1j * grid.omega[:, None, None] * spectra)
     result[:, :, :, P + p :] = free.transpose(1, 0, 2, 3)
     if plant.floats:
-        for i, parameter in enumerate(forward.system.parameters):
-            if i not in loads:
-                unit = np.eye(len(structure.H))[forward.system.elements.index(parameter.element)]
-                result[:, :, :, i] = _floating(forward, unit[None], ports, theta_forces[:, i, None, None])[..., 0]
-        for j in range(p):
-            result[:, :, :, P + j] = _floating(forward, ports, ports, law_forces[:, j, :, None])[..., 0]
-        for column, load in loads.items():
-            rest, line = plant.without_line(load)
-            steady = plant.polynomial_response(line_load(line)) @ (ports @ structure.H).T
-            swinging = np.einsum("fmn,fn->fm", plant.deflection_of_load(ports), rest)
-            result[0, :, :, column] = grid.inverse(swinging) + grid.monomials @ steady
-            rate = 1j * grid.omega[:, None] * swinging
-            result[1, :, :, column] = grid.inverse(rate) + grid.monomials @ plant.derivative(steady)
+        _set_unconstrained(result, forward, ports, theta_forces, loads, law_forces)
     return result
+
+
+def _set_unconstrained(
+    motions: FloatArray,
+    forward: Forward,
+    ports: FloatArray,
+    theta_forces: ComplexArray,
+    loads: dict[int, ComplexArray],
+    law_forces: ComplexArray,
+) -> None:
+    """Columns of `port_motions` of a system that nothing holds: forces have polynomial parts, too."""
+    plant, P = forward.plant, theta_forces.shape[1]
+    for i, parameter in enumerate(forward.system.parameters):
+        if i not in loads:
+            unit = np.eye(len(plant.structure.H))[forward.system.elements.index(parameter.element)]
+            motions[:, :, :, i] = _floating(forward, unit[None], ports, theta_forces[:, i, None, None])[..., 0]
+    for j in range(law_forces.shape[1]):
+        motions[:, :, :, P + j] = _floating(forward, ports, ports, law_forces[:, j, :, None])[..., 0]
+    for column, load in loads.items():
+        motions[:, :, :, column] = _floating_under(forward, load, ports)
+
+
+def _floating_under(forward: Forward, load: ComplexArray, ports: FloatArray) -> FloatArray:
+    """Motion along ports (m, E) of an unconstrained system under a load (F, n), (2, N, m)."""
+    plant, grid = forward.plant, forward.part.grid
+    rest, line = plant.without_line(load)
+    steady = plant.polynomial_response(line_load(line)) @ (ports @ plant.structure.H).T
+    swinging = np.einsum("fmn,fn->fm", plant.deflection_of_load(ports), rest)
+    deflection = grid.inverse(swinging) + grid.monomials @ steady
+    rate = grid.inverse(1j * grid.omega[:, None] * swinging) + grid.monomials @ plant.derivative(steady)
+    return np.stack([deflection, rate])
 
 
 def line_load(line: FloatArray) -> FloatArray:

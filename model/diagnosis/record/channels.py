@@ -277,12 +277,9 @@ def _by_role(
     for name in np.array(system.sensors)[~present]:
         if name not in frozen:
             notes.append(f"sensor {name} is missing: diagnosed without it")
-    if inputs.levelled is not None:
-        kept = _second_derivative(inputs.displacement[0], inputs.levelled, 1 / sample_rate)
-        sensors = _without_offsets(sensors, kept, system.mechanics.sensor_kind == ACCELERATION)
-    elif inputs.force_names and not inputs.support_names and _held(system, rules):
-        still = np.zeros(len(sensors))  # bounded motion has no mean acceleration
-        sensors = _without_offsets(sensors, still, system.mechanics.sensor_kind == ACCELERATION)
+    mean = _known_mean_acceleration(system, inputs, len(sensors), 1 / sample_rate, rules)
+    if mean is not None:
+        sensors = _without_offsets(sensors, mean, system.mechanics.sensor_kind == ACCELERATION)
     empty = np.zeros((len(values), 0))
     signals = Signals(
         sample_rate=sample_rate,
@@ -301,6 +298,20 @@ def _by_role(
         fused=tuple(inputs.fused),
     )
     return Prepared(signals, stuck, tuple(notes))
+
+
+def _known_mean_acceleration(
+    system: System, inputs: _Inputs, samples: int, dt: float, rules: RecordRules
+) -> FloatArray | None:
+    """An acceleration (T,) whose mean is that of all bodies; None where these may have any.
+
+    Bodies follow a support that carries everything, and bounded motion has no mean acceleration.
+    """
+    if inputs.levelled is not None:
+        return _second_derivative(inputs.displacement[0], inputs.levelled, dt)
+    if inputs.force_names and not inputs.support_names and _held(system, rules):
+        return np.zeros(samples)
+    return None
 
 
 def _held(system: System, rules: RecordRules) -> bool:
