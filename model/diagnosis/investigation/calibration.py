@@ -2,12 +2,10 @@
 
 No rig has exact gains and zeros and exactly simultaneous samples.  With little noise a gain error of one per cent or a
 delay of a hundredth of a sample is significant, and other laws that imitate it, such as a hung mass or an elastic mode,
-fit a little better.  Once one is found, gains, zeros and delays of all sensors and gains and zeros of measured forces
-become parameters of the model with the tolerances as prior (`gain_std`, `offset_std`, `delay_std` of an address), and
-the search restarts.  Values within tolerance are reported and have no effect on the verdict; their uncertainty is part
-of that of all other values.
-
-Masses belong to them as well: no body is weighed better than an instrument shows.
+fit a little better.  Once one is found, gains, zeros and delays of all sensors, gains and zeros of measured forces, and
+masses of all bodies, none of which is weighed better than an instrument shows, become parameters of the model with the
+tolerances as prior (`gain_std`, `offset_std`, `delay_std` of an address), and the search restarts.  Values within
+tolerance are reported and have no effect on the verdict; their uncertainty is part of that of all other values.
 
 With enough channels, one whose error is far larger than all others of its kind is a fault, however small: the
 instruments of one rig are comparable.
@@ -15,7 +13,7 @@ instruments of one rig are comparable.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,16 +29,20 @@ from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.plausible import hardly_there
-from sprung.model.laws import BodyLaw, Law, SensorLaw
+from sprung.model.laws import Law, SensorLaw
 from sprung.model.laws.base import DataSheet
+from sprung.model.laws.bodies import MASS_CHANGE
 from sprung.model.schema import SupportInput
 from sprung.model.system import System
 
-_STEPS = 12, 6  # of a fit of the structure with the calibration, and of one from a close start
+_STEPS = 12  # of a fit of the structure with the calibration
 
 
-def expected(system: System, signals: Signals, law: Law, location: str) -> float:
-    """Standard deviation of a fault's parameter by the data sheet of its channel; 0: not a calibration error."""
+def expected(system: System, signals: Signals, law: Law, location: str, rules: PlausibleRules) -> float:
+    """Standard deviation of a parameter by the data sheet of its channel or body; 0: not a calibration error."""
+    if law is MASS_CHANGE:
+        mass = system.file.bodies[location].mass
+        return rules.weighed if mass.std is None else mass.std / mass.value
     names = [channel.name for channel in system.channels][-len(system.tolerances) :]
     if not isinstance(law, SensorLaw) or law.of_instrument is None or location not in names:
         return 0.0
@@ -66,30 +68,25 @@ def _size(signals: Signals, location: str) -> float:
 
 
 def within_tolerance(state: Investigation, term: Term) -> bool:
-    """Whether an error is one of calibration, where such errors are part of the model.
-
-    A fault within the data sheet of its channel, or a body's mass as well as bodies of such a rig are weighed.
-    """
-    return bool(state.calibrations) and (within_data_sheet(state, term) or _as_weighed(state, term))
+    """Whether an error is one of calibration, where such errors are part of the model."""
+    return bool(state.calibrations) and within_data_sheet(state, term)
 
 
-def _as_weighed(state: Investigation, term: Term) -> bool:
-    """Whether another mass is within what the system file knows of it."""
-    if not (isinstance(term.law, BodyLaw) and term.law.scales == "mass"):
-        return False
-    rules, mass = state.options.rules.plausible, state.system.file.bodies[term.location].mass
-    spread = rules.weighed if mass.std is None else mass.std / mass.value
-    return bool(abs(term.parameters[0] - 1.0) <= rules.calibration * spread)
+def within_data_sheet(state: Investigation, term: Term) -> bool:
+    """Whether a fault is within the data sheet of its channel, or a mass within what the system file knows of it."""
+    return _in_deviations(state, term) <= state.options.rules.plausible.calibration
 
 
-def within_data_sheet(state: Investigation, term: Term, instruments: int = 1) -> bool:
-    """Whether a fault is within the data sheet of its channel.
+def may_be_calibration(state: Investigation, term: Term) -> bool:
+    """Whether a fault may be within a data sheet: a sensor is compared with an input, whose error it contains."""
+    within = 2 * state.options.rules.plausible.calibration
+    return isinstance(term.law, SensorLaw) and _in_deviations(state, term) <= within
 
-    instruments: factor on the tolerance; 2 where a sensor is compared with an input, whose error is contained, too.
-    """
-    spread = expected(state.system, state.signals, term.law, term.location)
-    off = abs(term.parameters[0] - term.law.absent[0]) if spread > 0 else np.inf
-    return bool(off <= instruments * state.options.rules.plausible.calibration * spread)
+
+def _in_deviations(state: Investigation, term: Term) -> float:
+    """Size of an error in standard deviations of its data sheet; infinite for other effects."""
+    spread = expected(state.system, state.signals, term.law, term.location, state.options.rules.plausible)
+    return abs(term.parameters[0] - term.law.absent[0]) / spread if spread > 0 else np.inf
 
 
 def is_outlier(terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:
@@ -113,7 +110,7 @@ def is_outlier(terms: Sequence[Term], key: tuple[str, str, str], rules: Plausibl
 
 
 def _relative_deviation(term: Term) -> float:
-    return (term.parameters[0] - term.law.absent[0]) / term.known[0]
+    return (term.parameters[0] - term.law.absent[0]) / term.scales[0]
 
 
 def is_gain(term: Term) -> bool:
@@ -147,25 +144,25 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     """The investigation with the calibration errors of all channels in its model, at the beginning of its search.
 
     first: the first that was found; if it is an outlier, it is a fault, and the model is not changed.
-    Errors beyond the tolerance beside the findings so far are left out, to be found as faults.  Gains of the inputs are
-    kept fixed from now on: their common part is only identifiable from the curvature of a law.
+    Errors of instruments beyond the tolerance beside the findings so far are left out, to be found as faults.  Gains of
+    the inputs are kept fixed from now on: their common part is only identifiable from the curvature of a law.
     """
-    file, terms = state.fit.point.terms[: state.given], _of_all_channels(state)
+    file, terms = state.fit.point.terms[: state.given], (*of_all_channels(state), *_of_all_bodies(state))
     keys = {term.key for term in terms}
     found = tuple(term for term in state.fit.point.terms[state.given :] if term.key not in keys)
     for _ in range(2):
-        fit = try_optimise(state.problem, replace(state.fit.point, terms=(*file, *terms, *found)), _STEPS[1])
+        fit = try_optimise(state.problem, replace(state.fit.point, terms=(*file, *terms, *found)), _STEPS)
         if fit is None:
             return replace(state, calibrations=0)
         fitted = centred(fit.point.terms[len(file) : len(file) + len(terms)])
         if is_outlier(fitted, first.key, state.options.rules.plausible):
             return replace(state, calibrations=0)
-        terms = tuple(term for term in fitted if within_data_sheet(state, term))
-        if len(terms) == len(fitted):
+        terms = tuple(_freed_beyond_tolerance(state, fitted))
+        if terms == fitted:
             break
     held = tuple(replace(term, fixed=(True,)) for term in terms)  # else they absorb part of the missing law
     problem = replace(state.problem, noise=state.base.noise)
-    base = try_optimise(problem, replace(state.base.point, terms=(*state.base.point.terms, *held)), _STEPS[0])
+    base = try_optimise(problem, replace(state.base.point, terms=(*state.base.point.terms, *held)), _STEPS)
     if base is None:
         return replace(state, calibrations=0)
     problem, base = refreshed(problem, base)
@@ -178,11 +175,20 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     return replace(begun, base=base, fit=base)
 
 
+def _freed_beyond_tolerance(state: Investigation, terms: Sequence[Term]) -> Iterator[Term]:
+    """Terms within tolerance, and masses beyond without a prior; other errors beyond are to be found as faults."""
+    for term in terms:
+        if within_data_sheet(state, term):
+            yield term
+        elif term.law is MASS_CHANGE:
+            yield replace(term, known=())
+
+
 def with_free_gains(state: Investigation, fit: Fit) -> Fit:
-    """A fit with gains, zeros and delays of sensors free; those of the inputs stay fixed."""
+    """A fit with masses, and gains, zeros and delays of sensors free; those of the inputs stay fixed."""
     sensors, terms = state.signals.sensor_names, list(fit.point.terms)
     for index in calibration_indices(state):
-        if terms[index].location in sensors:
+        if terms[index].location in sensors or terms[index].law is MASS_CHANGE:
             terms[index] = replace(terms[index], fixed=())
     return replace(fit, point=replace(fit.point, terms=tuple(terms)))
 
@@ -213,7 +219,21 @@ def _is_observable(law: SensorLaw, *, rate: bool, support: bool) -> bool:
     return bool(slope.gain or (moved and not support) or (slope.offset and not rate and not support))
 
 
-def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
+def _of_all_bodies(state: Investigation) -> Iterator[Term]:
+    """Masses of bodies that the system file does not estimate, as found."""
+    estimated, rules = {p.name for p in state.system.parameters}, state.options.rules.plausible
+    given = {term.key[:2] for term in state.fit.point.terms[: state.given]}
+    values = {term.key: term.parameters for term in state.fit.point.terms[state.given :]}
+    for name in state.system.bodies:
+        if f"{name}.{MASS_CHANGE.scales}" in estimated or (name, MASS_CHANGE.name) in given:
+            continue
+        spread = expected(state.system, state.signals, MASS_CHANGE, name, rules)
+        nothing = Term(MASS_CHANGE, name, MASS_CHANGE.absent, scales=(spread,), known=(spread,))
+        as_found = replace(nothing, parameters=values.get(nothing.key, MASS_CHANGE.absent))
+        yield as_found if within_data_sheet(state, as_found) else replace(as_found, known=())
+
+
+def of_all_channels(state: Investigation) -> tuple[Term, ...]:
     """Gain, zero and delay of every sensor, the first two of measured forces, gains of supports; values as found."""
     signals, part = state.signals, state.problem.part
     laws = [law for law in state.problem.system.catalogue if isinstance(law, SensorLaw)]
@@ -230,7 +250,7 @@ def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
     for channel, names in groups:
         for name in names:
             for law in laws:
-                spread = expected(state.system, signals, law, name)
+                spread = expected(state.system, signals, law, name, state.options.rules.plausible)
                 if not spread or channel not in law.at or (name, law.name) in given:
                     continue
                 if _is_observable(law, rate=name in rates, support=channel == "support"):

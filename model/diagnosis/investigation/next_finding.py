@@ -11,11 +11,12 @@ from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.calibration import (
     calibrated,
+    may_be_calibration,
     with_free_gains,
-    within_data_sheet,
     without_calibrations,
 )
 from sprung.model.diagnosis.investigation.formula_trial import with_formula
+from sprung.model.diagnosis.investigation.masses import imitates_errors, with_errors_instead
 from sprung.model.diagnosis.investigation.minor import is_minor, untried
 from sprung.model.diagnosis.investigation.setup import misfit
 from sprung.model.diagnosis.investigation.state import Found, Investigation, Progress
@@ -75,10 +76,14 @@ def _with_leading(state: Investigation, competition: _Competition, progress: Cal
     """
     trials, note = with_formula(state, competition.findings, competition.leading)
     chosen = trials[0]
+    if imitates_errors(state, chosen) and not _is_refuted(state, chosen):
+        state, chosen = with_errors_instead(state, chosen)
+        if state.calibrations:
+            return state
     p_value = _p_value(state, chosen)
     if _is_refuted(state, chosen) or p_value > state.options.rules.acceptance.alpha:
         return state
-    if state.calibrations is None and within_data_sheet(state, chosen.term, instruments=2):
+    if state.calibrations is None and may_be_calibration(state, chosen.term):
         state = calibrated(state, chosen.term)
         if state.calibrations:
             return state

@@ -23,6 +23,7 @@ from sprung.model.diagnosis.selection.evidence import (
     chance,
     monotone_gains,
     occam_cost,
+    prior_cost,
     process_gain,
     profile_gain,
     unusual_cost,
@@ -281,18 +282,32 @@ def _converged_fit(problem: Problem, base: Fit, trial: Trial) -> Trial:
 
 def _trial(problem: Problem, base: Fit, candidate: Candidate, fit: Fit, quiet: float | None = None) -> Trial:
     """A fit with its evidence over the base.  quiet: level below which blocks are no evidence; None: by the rules."""
-    rules = problem.rules.evidence
-    quiet = rules.quiet if quiet is None else quiet
-    sensors = len(problem.sensors)
+    gain, reduction = _gain(problem, base, fit, problem.rules.evidence.quiet if quiet is None else quiet)
+    freedom = len(candidate.term.parameters) + len(fit.point.state) - len(base.point.state)
+    return Trial(candidate, fit, gain, reduction, gain - cost(fit, problem.rules.evidence), freedom)
+
+
+def _gain(problem: Problem, base: Fit, fit: Fit, quiet: float) -> tuple[float, float]:
+    """Twice the log-likelihood ratio of a fit over the base; reduction of chi-square or of unmeasured forces."""
+    rules, sensors = problem.rules.evidence, len(problem.sensors)
     if problem.process_noise:  # candidates differ in the noise level of the forces
         gain = process_gain(base.residual, fit.residual, sensors, (base.log_det, fit.log_det), rules)
-        reduction = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
-    else:
-        reduction = base.chi_square - fit.chi_square
-        gain = min(reduction, profile_gain(base.residual, fit.residual, sensors, quiet, rules))
-    parameter_cost = cost(fit, rules)
-    freedom = len(candidate.term.parameters) + len(fit.point.state) - len(base.point.state)
-    return Trial(candidate, fit, gain, reduction, gain - parameter_cost, freedom)
+        return gain, float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
+    reduction = base.chi_square - fit.chi_square
+    return min(reduction, profile_gain(base.residual, fit.residual, sensors, quiet, rules)), reduction
+
+
+def evidence_together(problem: Problem, base: Fit, terms: Sequence[Term], iterations: int) -> float:
+    """Evidence of several terms at once over the base, those with priors included; -inf where their fit diverges."""
+    point = replace(base.point, terms=(*base.point.terms, *terms))
+    fit = try_optimise(problem, point, iterations, base.whitener)
+    if fit is None:
+        return -np.inf
+    rules, first = problem.rules.evidence, len(base.point.terms)
+    gain, _ = _gain(problem, base, fit, rules.quiet)
+    for index, term in enumerate(fit.point.terms[first:], first):
+        gain -= cost(fit, rules, index) + float(np.sum(term.prior_deviations**2))
+    return gain
 
 
 def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> list[Trial]:
@@ -311,6 +326,8 @@ def cost(fit: Fit, rules: EvidenceRules = RULES.evidence, index: int = -1) -> fl
     block = fit.covariance[place, place]
     if not term.law.named:  # amplitudes of one curve, correlated by convention: each counts by itself
         block = np.diag(np.diag(block))
+    if term.known:
+        return prior_cost(term.known, block)
     logs = [spec.log for spec in term.law.parameters]
     total = occam_cost(logs, term.scales, block / np.outer(term.slopes, term.slopes), rules)
     for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):

@@ -67,7 +67,8 @@ def test_a_gain_that_all_channels_share_is_taken_out_of_them() -> None:
 def test_gains_of_sensors_move_beside_a_law_and_those_of_what_drives_everything_do_not() -> None:
     gain = find_law("sensor_gain")
     kept = [Term(gain, name, (1.01,), known=(0.015,), fixed=(True,)) for name in ("car_a", "road.displacement")]
+    kept.append(Term(find_law("mass_change"), "car", (1.01,), known=(0.015,), fixed=(True,)))
     law = Term(find_law("coulomb_friction"), "secondary", (300.0, 0.002), fixed=(False, True))
     fit: Any = make_dataclass("_Fit", ["point"])(Point(np.zeros(0), (*kept, law), np.zeros(0)))
-    state: Any = SimpleNamespace(signals=SimpleNamespace(sensor_names=("car_a",)), given=2, calibrations=2)
-    assert [term.fixed for term in with_free_gains(state, fit).point.terms] == [(), (True,), (False, True)]
+    state: Any = SimpleNamespace(signals=SimpleNamespace(sensor_names=("car_a",)), given=3, calibrations=3)
+    assert [term.fixed for term in with_free_gains(state, fit).point.terms] == [(), (True,), (), (False, True)]
