@@ -18,7 +18,7 @@ from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_sta
 from sprung.model.diagnosis.response.motion import Motions, motions_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import evaluated_in_time
-from sprung.model.laws import SensorLaw
+from sprung.model.laws import BodyLaw, SensorLaw
 from sprung.model.signals import FloatArray
 
 
@@ -85,7 +85,7 @@ class Linearised:
     def _sensitivities(self) -> _Sensitivities:
         problem, point, working = self.problem, self.point, self.working
         known = _of_theta(problem, self.forward, self.forces, working.whitener, self.motions, point)
-        _add_terms(known, problem, point, working, self.forward, self.forces, self.shown)
+        _add_terms(known, problem, point, working, self.forward, self.forces, self.shown, self.motions)
         known.packed.add_free(len(known.log_det), self.free)
         if self.forces is not None:
             _add_laws_answers(known, problem, working.whitener, self.forward, self.forces, self.free.shape[2])
@@ -164,8 +164,13 @@ def _add_terms(
     forward: Forward,
     forces: LawForces | None,
     shown: ComplexArray,
+    motions: Motions,
 ) -> None:
-    """Columns of the terms' parameters, without the reaction of the laws."""
+    """Columns of the terms' parameters, without the reaction of the laws.
+
+    Another mass gets its column in the same way as an estimated one: what masses, stiffnesses and dampings together
+    leave unchanged is not determined, however approximate the reaction of the laws is.
+    """
     at = P = len(point.theta)
     measured = forward.with_part(problem.part)
     for index, term in enumerate(point.terms):
@@ -175,6 +180,12 @@ def _add_terms(
                 known.packed.add_load(at, known.loads[at])
                 if problem.process_noise:
                     change = forward.inputs_by_force_fault(term)[forward.part.grid.band]
+                    known.log_det[at] = working.whitener.log_det_slope(change)
+            elif isinstance(term.law, BodyLaw) and term.law.scales:
+                known.loads[at] = inertial_load(forward, motions, term.location)
+                known.packed.add_load(at, known.loads[at])
+                if problem.process_noise:
+                    change = _inputs_by_mass(forward, term.location)
                     known.log_det[at] = working.whitener.log_det_slope(change)
             elif forces is not None and evaluated_in_time(term):
                 port, change = law_change(forward, forces, term, j)
@@ -212,8 +223,7 @@ def _theta_forces(forward: Forward, motions: Motions) -> tuple[ComplexArray, dic
     loads = {}
     for i, parameter in enumerate(forward.system.parameters):
         if parameter.quantity == "mass":
-            dofs = structure.body_of_dof == forward.system.bodies.index(parameter.element)
-            loads[i] = np.where(dofs, -structure.mass * motions.acceleration, 0.0)
+            loads[i] = inertial_load(forward, motions, parameter.element)
             continue
         value = parameter.nominal * np.exp(forward.theta[i])
         element = forward.system.elements.index(parameter.element)
@@ -225,6 +235,20 @@ def _theta_forces(forward: Forward, motions: Motions) -> tuple[ComplexArray, dic
             elif branch.element == element and parameter.quantity == "stiffness" and branch.of_spring:
                 forces[:, i] += branch.impedance(omega) * motions.deflection[:, element]
     return forces, loads
+
+
+def inertial_load(forward: Forward, motions: Motions, body: str) -> ComplexArray:
+    """Load (F, n) on the degrees of freedom equivalent to d/d log of a body's mass and inertias."""
+    structure = forward.plant.structure
+    own = structure.body_of_dof == forward.system.bodies.index(body)
+    load: ComplexArray = np.where(own, -structure.mass * motions.acceleration, 0.0)
+    return load
+
+
+def _inputs_by_mass(forward: Forward, body: str) -> ComplexArray:
+    """Derivative of the response to inputs by the log of a body's mass, in the band."""
+    own = forward.plant.structure.body_of_dof == forward.system.bodies.index(body)
+    return forward.inputs_by_mass(own)[forward.part.grid.band]
 
 
 def _difference(
@@ -275,8 +299,7 @@ def _log_det_slopes(forward: Forward, whitener: Whitener) -> FloatArray:
     for i, parameter in enumerate(forward.system.parameters):
         value = parameter.nominal * np.exp(forward.theta[i])
         if parameter.quantity == "mass":
-            dofs = plant.structure.body_of_dof == forward.system.bodies.index(parameter.element)
-            change = forward.inputs_by_mass(dofs)[band]
+            change = _inputs_by_mass(forward, parameter.element)
         else:
             element = forward.system.elements.index(parameter.element)
             factor = value * (jw if parameter.quantity == "damping" else 1.0)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.ndimage import median_filter
 
-from sprung.model.diagnosis.fit.jacobian import sensitivities_to_loads
+from sprung.model.diagnosis.fit.jacobian import inertial_load, sensitivities_to_loads
 from sprung.model.diagnosis.response.forward import structure_of
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ScreeningRules
@@ -42,22 +42,21 @@ def _masses(projector: Projector, law: BodyLaw) -> Iterator[tuple[Candidate, int
     """Other masses of bodies; stiffness and damping absorb most of them, so that the laws' reaction counts."""
     fit, problem, band = projector.fit, projector.problem, projector.grid.band
     structure, estimated = fit.forward.plant.structure, {p.name for p in problem.system.parameters}
-    held = [i for i, name in enumerate(problem.system.bodies) if f"{name}.{law.scales}" not in estimated]
-    dofs = [structure.body_of_dof == index for index in held]
-    loads = [np.where(own, -structure.mass * fit.motions.acceleration, 0.0) for own in dofs]
+    held = [name for name in problem.system.bodies if f"{name}.{law.scales}" not in estimated]
+    loads = [inertial_load(fit.forward, fit.motions, name) for name in held]
     if held and fit.forces is not None and not problem.process_noise:
         columns = sensitivities_to_loads(problem, fit.forward, fit.forces, fit.whitener, loads)
         scores = [projector.score(column, least=problem.rules.screening.reaction**2) for column in columns.T]
     else:
         shown = [projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load[band])) for load in loads]
         spreads = [
-            projector.spread(column, fit.forward.inputs_by_mass(own)[band])
-            for column, own in zip(shown, dofs, strict=True)
+            projector.spread(column, fit.forward.inputs_by_mass(structure.body_of_dof == index)[band])
+            for column, index in zip(shown, map(problem.system.bodies.index, held), strict=True)
         ]
         scores = [projector.score(column, (spread, 0.0)) for column, spread in zip(shown, spreads, strict=True)]
-    for index, (score, amplitude) in zip(held, scores, strict=True):
+    for name, (score, amplitude) in zip(held, scores, strict=True):
         ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
-        yield Candidate(Term(law, problem.system.bodies[index], (ratio,), variant="", scales=(0.1,)), score, MASS), 1
+        yield Candidate(Term(law, name, (ratio,), variant="", scales=(0.1,)), score, MASS), 1
 
 
 def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterator[tuple[Candidate, int]]:
