@@ -6,9 +6,11 @@ Environment variables `SPRUNG_<NAME>` set the defaults of the command line's opt
 from __future__ import annotations
 
 import ipaddress
+import logging
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +18,10 @@ from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from sprung.service.errors import UserError
+
+log = logging.getLogger("sprung")
+PREFIX = "SPRUNG_"
+OTHERS = ("TOKEN", "DEBUG")  # variables that are read elsewhere
 
 
 def default_data_dir() -> Path:
@@ -32,7 +38,7 @@ def default_data_dir() -> Path:
 class Settings(BaseSettings):
     """Bounds are deliberate: every queue, body, file and label set of the service has one."""
 
-    model_config = SettingsConfigDict(env_prefix="SPRUNG_", frozen=True, extra="ignore")
+    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="ignore")
 
     data_dir: Path = Field(default_factory=default_data_dir)  # uploads, reports and the embedded store
     store: str | None = None  # SQLAlchemy URL; None: sprung.db in data_dir
@@ -154,9 +160,26 @@ def settings_with(options: Mapping[str, Any]) -> Settings:
 
     Raises UserError that names a variable or option which cannot be used.
     """
+    for name, meant in misspelt(os.environ):
+        log.warning("%s is no setting; did you mean %s?", name, meant)
     try:
         return Settings(**{name: value for name, value in options.items() if value is not None})
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(map(str, first["loc"]))
         raise UserError(f"setting {name} (SPRUNG_{name.upper()}): {first['msg']}") from error
+
+
+def misspelt(environment: Iterable[str]) -> list[tuple[str, str]]:
+    """Variables that are no setting but nearly one, each with that one.
+
+    Others that begin with SPRUNG_ are left alone: Kubernetes, for one, sets some for a service of that name.
+    """
+    known = [name.upper() for name in Settings.model_fields]
+    found = []
+    for variable in sorted(environment):
+        name = variable.upper().removeprefix(PREFIX)
+        if variable.upper().startswith(PREFIX) and name not in (*known, *OTHERS):
+            close = get_close_matches(name, known, n=1, cutoff=0.75)
+            found += [(variable, f"{PREFIX}{one}") for one in close]
+    return found

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from itertools import chain
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
-from pydantic_core import from_json
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, WithJsonSchema
+from pydantic_core import PydanticCustomError, from_json
 
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -19,7 +20,20 @@ from sprung.service.fleet.message import SentWindows
 from sprung.service.monitoring.engine import Engine
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
-VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")]
+VEHICLE_ID = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")
+
+
+def _vehicle_id(text: str) -> str:
+    if VEHICLE_ID.fullmatch(text) is None:  # people type it, too: no regular expression for them
+        raise PydanticCustomError(
+            "vehicle_id", "letters, digits and . _ : - only, at most 128, first a letter or digit"
+        )
+    return text
+
+
+VehicleId = Annotated[
+    str, AfterValidator(_vehicle_id), WithJsonSchema({"type": "string", "pattern": VEHICLE_ID.pattern})
+]
 LINE_PATTERN = f"^[^{CONTROL}{UNSEEN}]*$"
 TEXT_PATTERN = rf"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f{UNSEEN}]*$"  # with lines and tabs
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]

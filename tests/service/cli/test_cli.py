@@ -23,7 +23,7 @@ from sprung.service.cli import describe, main
 from sprung.service.cli.bench import parse
 from sprung.service.errors import UserError
 from sprung.service.monitoring.engine import Engine, make_tracker
-from sprung.service.settings import Settings
+from sprung.service.settings import Settings, settings_with
 from tests.diagnosis_cases import simulate
 from tests.service_fakes import START, FakeIdentifier
 
@@ -248,6 +248,17 @@ def test_a_setting_that_cannot_be_is_named(capsys: pytest.CaptureFixture[str], m
     monkeypatch.setenv("SPRUNG_BATCH_WINDOWS", "many")
     assert main(["replay", __file__]) == 2
     assert "SPRUNG_BATCH_WINDOWS" in capsys.readouterr().err
+
+
+def test_a_setting_that_is_nearly_one_is_told(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("SPRUNG_OPNE", "SPRUNG_DATA_DIR", "SPRUNG_DEBUG", "SPRUNG_SERVICE_HOST", "SPRUNG_PORT_8000_TCP"):
+        monkeypatch.setenv(name, "x")
+    settings_with({})
+    assert [record.getMessage() for record in caplog.records] == [
+        "SPRUNG_OPNE is no setting; did you mean SPRUNG_OPEN?"
+    ]
 
 
 def test_an_unexpected_error_is_one_line_too() -> None:

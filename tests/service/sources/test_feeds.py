@@ -140,7 +140,8 @@ def test_unknown_kinds_of_files_are_refused(client: TestClient, recording: Path)
 
 
 def test_a_wrong_vehicle_in_the_form_is_refused(client: TestClient, recording: Path) -> None:
-    assert upload(client, recording, vehicle="../x").status_code == 422
+    answer = upload(client, recording, vehicle="../x")
+    assert answer.status_code == 422 and answer.json()["detail"].startswith("vehicle: letters, digits and . _ : - only")
 
 
 def test_an_upload_that_cannot_be_read_fails_with_one_line_and_the_users_name_for_it(
