@@ -75,14 +75,10 @@ class Fusion:
         conditions: Conditions | None,
     ) -> tuple[TrackerState, Jump | None]:
         """State after a usable window, and a deviation that has jumped."""
-        settings, model = self.settings, self.model
-        elapsed = np.inf if state.last is None else (time_ns - state.last) * 1e-9
-        share, belief = min(1.0, elapsed / settings.window), state.belief
-        if state.last is not None:
-            belief = kalman.predict(belief, elapsed, settings.process, settings.prior, model.walk, self.limit)
-        found = estimate.deviating if model.size else None
+        belief, elapsed = self._predicted(state, time_ns)
+        found = estimate.deviating if self.model.size else None
         belief, cargo = self._with_loads(state, belief, elapsed, found, conditions)
-        weight = noise_weight(estimate.noise)
+        share, weight = min(1.0, elapsed / self.settings.window), noise_weight(estimate.noise)
         belief, calibration, found, jump, agrees = self._with_deviations(
             state.calibration, belief, found, time_ns, (share, weight)
         )
@@ -98,8 +94,7 @@ class Fusion:
         window = in_linear_scale(window, belief)
         filtered = self._filtered(state, belief, calibration, window)
         weather, tested = self._tested(state, calibration, conditions, window, filtered)
-        lately = any(a.kind == "sensor" and (centre - a.opened) * 1e-9 < SETTLING for a in state.alarms)
-        settled = jump is None and not lately and calibration.ratio.max(initial=0.0) < dev.SUSPECTED
+        settled = jump is None and _is_settled(state, calibration, centre)
         new = replace(
             state,
             last=time_ns,
@@ -116,6 +111,14 @@ class Fusion:
             cargo=cargo,
         )
         return new, jump
+
+    def _predicted(self, state: TrackerState, time_ns: int) -> tuple[kalman.Belief, float]:
+        """Belief before a window, and the seconds since the last one; infinite before any."""
+        if state.last is None:
+            return state.belief, np.inf
+        elapsed, settings = (time_ns - state.last) * 1e-9, self.settings
+        predicted = kalman.predict(state.belief, elapsed, settings.process, settings.prior, self.model.walk, self.limit)
+        return predicted, elapsed
 
     def _with_deviations(
         self,
@@ -289,6 +292,12 @@ class Fusion:
         variance = dev.level_variance(state.belief, self.model, state.calibration.base_cross)
         spread = np.sqrt(variance + state.changes.baseline_variance)
         return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
+
+
+def _is_settled(state: TrackerState, calibration: dev.DeviationRecord, now: int) -> bool:
+    """Whether no deviation is suspected to have jumped, nor has jumped a short time ago."""
+    lately = any(a.kind == "sensor" and (now - a.opened) * 1e-9 < SETTLING for a in state.alarms)
+    return not lately and calibration.ratio.max(initial=0.0) < dev.SUSPECTED
 
 
 def _pressure(conditions: Conditions | None, loads: int) -> FloatArray:
