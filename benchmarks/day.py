@@ -41,7 +41,7 @@ FAULTS = {"damping": 0.85, "stiffness": 0.92}
 
 
 @dataclass(frozen=True, slots=True)
-class Life:
+class VehicleLife:
     """What happened to one vehicle."""
 
     days: float
@@ -141,7 +141,7 @@ def boarded(rng: np.random.Generator, service: Service, empty: FloatArray) -> Fl
 
 def live(
     system: System, windows: list[Pool], days: float, seed: int, *, measured: bool, fault: str | None = None
-) -> Life:
+) -> VehicleLife:
     """One vehicle for `days`; `measured`: its air temperature is; `fault`: parameter that loses its share at once."""
     rng = np.random.default_rng([seed, 7])
     service, names = Service(), [p.name for p in system.parameters]
@@ -199,11 +199,11 @@ def _off(part: Any, index: int, clocks: FloatArray, drift: FloatArray, clock: fl
     return float(drift[index] * clock) if part.kind == "gain" else 0.0
 
 
-def _judged(state: TrackerState, days: float, rides: tuple[int, int], began: float, fault: str | None) -> Life:
+def _judged(state: TrackerState, days: float, rides: tuple[int, int], began: float, fault: str | None) -> VehicleLife:
     kinds = [a for a in state.alarms if a.kind in ("change", "misfit")]
     after = [a for a in kinds if a.opened * 1e-9 >= began * DAY]
     right = [a for a in after if a.parameter == fault]
-    return Life(
+    return VehicleLife(
         days, *rides, [f"{a.kind} {a.parameter}" for a in kinds if a not in right],
         sum(a.kind == "sensor" for a in state.alarms),
         min((a.opened * 1e-9 - began * DAY for a in right), default=None),
@@ -212,7 +212,7 @@ def _judged(state: TrackerState, days: float, rides: tuple[int, int], began: flo
 
 
 @dataclass(frozen=True)
-class Lives:
+class VehicleLives:
     """Lives of one run, each taken from `folder` where it has been lived before."""
 
     system: System
@@ -230,7 +230,7 @@ class Lives:
     def ours(self, number: int) -> bool:
         return number % self.part[1] == self.part[0] - 1
 
-    def life(self, days: float, seed: int, *, measured: bool, fault: str | None = None) -> Life:
+    def life(self, days: float, seed: int, *, measured: bool, fault: str | None = None) -> VehicleLife:
         file = None if self.folder is None else self.folder / f"life-{seed}.json"
         settings = [days, seed, measured, fault, self.windows, self.seed, POOLED, ALIKE, FAULTS, asdict(Service())]
         settings = json.loads(json.dumps(settings))  # as they are read back
@@ -239,7 +239,7 @@ class Lives:
             lived = live(self.system, self.pools, days, seed, measured=measured, fault=fault)
             keep(file, settings, asdict(lived))
             return lived
-        return Life(**known)
+        return VehicleLife(**known)
 
 
 def run(
@@ -263,7 +263,7 @@ def run(
     system = load_system()
     which, of = (int(x) for x in part.split("/"))
     if months or faults:
-        lives = Lives(system, windows, seed, folder, (which, of))
+        lives = VehicleLives(system, windows, seed, folder, (which, of))
         yield from _healthy(lives, months)
         yield from _hidden(lives, faults)
     if hours:
@@ -272,7 +272,7 @@ def run(
         yield from full_hours(ours, seed, folder, seconds=seconds, cruise=(slow, fast))
 
 
-def _healthy(some: Lives, months: float) -> Iterator[dict[str, Any]]:
+def _healthy(some: VehicleLives, months: float) -> Iterator[dict[str, Any]]:
     begin, lives = time.process_time(), []
     for number in filter(some.ours, range(max(1, round(months)) if months else 0)):
         days = min(1.0, months) * MONTH / DAY
@@ -292,7 +292,7 @@ def _healthy(some: Lives, months: float) -> Iterator[dict[str, Any]]:
     yield {"name": "unmonitored", "value": 100 * unused / rides, "unit": "% of rides", "target": "< 1"}
 
 
-def _hidden(some: Lives, faults: int) -> Iterator[dict[str, Any]]:
+def _hidden(some: VehicleLives, faults: int) -> Iterator[dict[str, Any]]:
     rng = np.random.default_rng([some.seed, 9])
     names = [p.name for p in some.system.parameters]
     for quantity in FAULTS if faults else ():
@@ -309,7 +309,7 @@ def _hidden(some: Lives, faults: int) -> Iterator[dict[str, Any]]:
             yield from _found(lives, {"quantity": quantity, "change": f"{100 * (FAULTS[quantity] - 1):.0f} %"})
 
 
-def _found(lives: list[Life], note: dict[str, Any]) -> Iterator[dict[str, Any]]:
+def _found(lives: list[VehicleLife], note: dict[str, Any]) -> Iterator[dict[str, Any]]:
     after = [life.found_after for life in lives if life.found_after is not None]
     soon, isolated = sum(a <= DAY for a in after), sum(life.isolated for life in lives)
     note = note | {"of": len(lives)}

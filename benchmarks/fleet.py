@@ -33,7 +33,7 @@ from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
 from sprung.service.sources.feed import feed_file
-from sprung.service.sources.reading import Here, ReadRequest
+from sprung.service.sources.reading import ReadRequest, ThreadReading
 
 Figures = Iterator[dict[str, Any]]
 FIRST = 1_790_000_000_000_000_000  # ns
@@ -181,7 +181,7 @@ def edge(seconds: float) -> Figures:
         hop = engine.system.hop / engine.system.sample_rate
         per = round(20 / hop)  # windows that are read before they are handed over
         begun = None
-        for piece in Here(ReadRequest(source, engine.system, engine.dbc, per)).pieces(lambda: None):
+        for piece in ThreadReading(ReadRequest(source, engine.system, engine.dbc, per)).pieces(lambda: None):
             if begun is None and onboard.counts.windows:  # what is loaded and compiled once does not count
                 begun = (time.process_time(), onboard.counts.windows)
             onboard.process("bench-0001", piece.windows)

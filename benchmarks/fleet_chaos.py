@@ -71,7 +71,7 @@ class KilledPart:
 
 
 @dataclass
-class ChaosTold:
+class ChaosOutcome:
     """What happened."""
 
     recoveries: list[tuple[str, float]] = field(default_factory=list)
@@ -111,7 +111,7 @@ def chaos(minutes: float, every: float) -> Figures:
                 stack.callback(_end_part, part)
         rounds = max(1, round(60 * minutes * 2 / MOST_WINDOWS))
         messages = _messages(engine, rounds)
-        outcome = ChaosTold()
+        outcome = ChaosOutcome()
         links: list[tuple[ClosedLink, Sequence[str]]] = [(NatsLink(address, "chaos"), published)]
         links += [(HttpLink(f"http://127.0.0.1:{port}", None, name), [name]) for name in posting]
         _ride(links, messages, parts, watched, (60 * minutes, every), outcome)
@@ -145,7 +145,7 @@ def _ride(
     parts: list[KilledPart],
     store: Store,
     times: tuple[float, float],
-    outcome: ChaosTold,
+    outcome: ChaosOutcome,
 ) -> None:
     """Send over all links at once for times[0] seconds, disturbed every times[1]; returns when all is taken."""
     senders = []
@@ -181,7 +181,7 @@ def _messages(engine: Any, rounds: int) -> list[Message]:
     return messages
 
 
-def _publish(link: ClosedLink, messages: list[Message], seconds: float, outcome: ChaosTold) -> None:
+def _publish(link: ClosedLink, messages: list[Message], seconds: float, outcome: ChaosOutcome) -> None:
     """As an edge does: each until it is taken, evenly over the time."""
     begun = time.monotonic()
     for i, message in enumerate(messages):
@@ -193,7 +193,7 @@ def _publish(link: ClosedLink, messages: list[Message], seconds: float, outcome:
     link.close()
 
 
-def _disturb(parts: list[KilledPart], store: Store, seconds: float, every: float, outcome: ChaosTold) -> None:
+def _disturb(parts: list[KilledPart], store: Store, seconds: float, every: float, outcome: ChaosOutcome) -> None:
     rng, begun = random.Random(7), time.monotonic()
     order: list[KilledPart] = []
     while time.monotonic() - begun + every < seconds:

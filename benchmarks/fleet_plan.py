@@ -26,7 +26,7 @@ from sprung.service.fleet import local_postgres as postgres
 from sprung.service.fleet.backfill import engine_of
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.pipeline import Pipeline
-from sprung.service.monitoring.processed import ToFold
+from sprung.service.monitoring.processed import WindowsToFold
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
 from sprung.service.store.archive import Archive
@@ -148,7 +148,9 @@ def _fold(pipeline: Pipeline, parts: list[dict[str, list[tuple[int, Estimate]]]]
         with pipeline.store.write() as connection:
             held = pipeline.hold_all(connection, part)
             asked = [
-                ToFold(v, [Window(at, system.sample_rate, empty) for at, _ in found], [e for _, e in found], held[v])
+                WindowsToFold(
+                    v, [Window(at, system.sample_rate, empty) for at, _ in found], [e for _, e in found], held[v]
+                )
                 for v, found in part.items()
             ]
             done = pipeline.fold_all(connection, asked)

@@ -34,7 +34,7 @@ SPEED = (30.0, 55.0)  # m/s
 
 
 @dataclass(frozen=True)
-class Below:
+class AxleBoxSensing:
     """A set of sensors with some on the axle boxes."""
 
     name: str
@@ -43,8 +43,8 @@ class Below:
 
 
 BELOW = (
-    Below("axle boxes: displacement and velocity", "manchester.yaml", (0, 1)),
-    Below("axle boxes: acceleration only", "axleboxes.yaml", (2,)),
+    AxleBoxSensing("axle boxes: displacement and velocity", "manchester.yaml", (0, 1)),
+    AxleBoxSensing("axle boxes: acceleration only", "axleboxes.yaml", (2,)),
 )
 
 
@@ -58,7 +58,7 @@ def run(windows: int = 1200, bounds: int = 40, rides: int = 24, cases: int = 24,
         yield from ambient.isolation(cases, 60.0, seed)
 
 
-def accuracy(below: Below, count: int, bounds: int, seed: int) -> Iterator[dict[str, Any]]:
+def accuracy(below: AxleBoxSensing, count: int, bounds: int, seed: int) -> Iterator[dict[str, Any]]:
     """Error over the bound, coverage and speed with sensors on the axle boxes."""
     system = load_system(BUNDLED / below.file)
     rng = np.random.default_rng([seed, len(below.orders)])

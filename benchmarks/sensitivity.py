@@ -25,7 +25,7 @@ import numpy as np
 from sprung.benchmarks.concealed import engine_digest
 from sprung.benchmarks.keeping import keep, kept
 from sprung.benchmarks.sensitivity_cases import Made, recordings
-from sprung.benchmarks.setups import Falsified
+from sprung.benchmarks.setups import FalsifiedRecording
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.component.measured import is_component_test
 from sprung.model.diagnosis.fit.memory import FitMemory
@@ -47,7 +47,7 @@ FIRST = ("input_faults", "input_rounds", "input_rival", "input_rivals", "input_d
 
 
 @dataclass(frozen=True)
-class Said:
+class ReportedResult:
     """What a report decides."""
 
     verdict: str
@@ -55,12 +55,12 @@ class Said:
     p_values: tuple[float | None, ...]
 
     @classmethod
-    def of(cls, report: Report) -> Said:
+    def of(cls, report: Report) -> ReportedResult:
         """From a report."""
         names = tuple((f.location, f.family or f.effect) for f in report.findings)
         return cls(report.verdict, names, tuple(f.p_value for f in report.findings))
 
-    def decades(self, other: Said) -> float:
+    def decades(self, other: ReportedResult) -> float:
         """Largest move of a p-value, in powers of ten; those below 1e-30 count as that."""
         pairs = zip(self.p_values, other.p_values, strict=False)
         moves = [abs(np.log10(max(a, 1e-30) / max(b, 1e-30))) for a, b in pairs if a is not None and b is not None]
@@ -73,22 +73,22 @@ class Subject:
 
     name: str
     system: System
-    record: Falsified
+    record: FalsifiedRecording
     options: Options
-    said: Said
+    said: ReportedResult
     reads: tuple[str, ...] = ()  # stages that alone decide: of component tests, of structures without inputs
     state: Investigation | None = None  # begun; None for those
     outcome: Outcome | None = None
 
-    def again(self, stage: str, name: str, rules: Rules) -> Said:
+    def again(self, stage: str, name: str, rules: Rules) -> ReportedResult:
         """What is said under other rules, doing again what they can change."""
         if self.state is None or self.outcome is None:
-            return Said.of(diagnose(self.system, self.record, replace(self.options, rules=rules)))
+            return ReportedResult.of(diagnose(self.system, self.record, replace(self.options, rules=rules)))
         if stage in LAST:
             done = self.outcome
             state = under(done.investigation, rules)
             judgement = judged(state, done.before, done.after, done.noise_faults, done.judgement.ended)
-            return Said.of(compose(replace(done, investigation=state, judgement=judgement), self.record))
+            return ReportedResult.of(compose(replace(done, investigation=state, judgement=judgement), self.record))
         if stage in LATE and name not in FIRST:
             state = under(self.state, rules)
         else:
@@ -96,8 +96,8 @@ class Subject:
         state, usual = with_findings(state, _silent), self.outcome
         same = usual.investigation
         if stage != "noise" and (state.fit is same.fit and state.base is same.base):  # as remembered: the same model
-            return Said.of(compose(replace(usual, investigation=state), self.record))
-        return Said.of(compose(concluded(state, _silent), self.record))
+            return ReportedResult.of(compose(replace(usual, investigation=state), self.record))
+        return ReportedResult.of(compose(concluded(state, _silent), self.record))
 
 
 def run(
@@ -261,7 +261,7 @@ def _named(findings: list[tuple[str, str]]) -> str:
     return " + ".join(f"{place} {effect}" for place, effect in findings) or "none"
 
 
-def _difference(before: Said, after: Said) -> dict[str, Any]:
+def _difference(before: ReportedResult, after: ReportedResult) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if before.verdict != after.verdict:
         found["verdict"] = [before.verdict, after.verdict]
@@ -270,15 +270,15 @@ def _difference(before: Said, after: Said) -> dict[str, Any]:
     return found
 
 
-def _known(name: str, system: System, record: Falsified) -> Subject:
+def _known(name: str, system: System, record: FalsifiedRecording) -> Subject:
     """A recording diagnosed under the usual rules, with the steps on the way."""
     options = Options(file=name, memory=FitMemory())
     if is_component_test(system, record.values) or not system.file.inputs:
         reads = ALONE["component" if system.file.inputs else "ambient"]
-        return Subject(name, system, record, options, Said.of(diagnose(system, record, options)), reads)
+        return Subject(name, system, record, options, ReportedResult.of(diagnose(system, record, options)), reads)
     state = begun(system, record, options, _silent)
     outcome = concluded(with_findings(state, _silent), _silent)
-    return Subject(name, system, record, options, Said.of(compose(outcome, record)), (), state, outcome)
+    return Subject(name, system, record, options, ReportedResult.of(compose(outcome, record)), (), state, outcome)
 
 
 def _silent(share: float, text: str) -> None:

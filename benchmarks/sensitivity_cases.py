@@ -18,7 +18,7 @@ from scipy.linalg import expm
 from scipy.signal import decimate
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
-from sprung.benchmarks.setups import Falsified, falsified, in_order
+from sprung.benchmarks.setups import FalsifiedRecording, falsified, in_order
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import MANCHESTER, System, load_system, parse_system
@@ -166,7 +166,7 @@ PARTICULAR = (
 )
 
 
-Made = tuple[System, Falsified]
+Made = tuple[System, FalsifiedRecording]
 
 
 def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[tuple[str, Callable[[], Made]]]:
@@ -188,11 +188,11 @@ def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[t
     yield "shaken, exchanged", partial(_made, SHAKEN, shaken, seed + 3)
 
 
-def _made(text: str, make: Callable[..., Falsified], seed: int, *more: float) -> Made:
+def _made(text: str, make: Callable[..., FalsifiedRecording], seed: int, *more: float) -> Made:
     return parse_system(text), make(np.random.default_rng(seed), *more)
 
 
-def _known(system: System, record: Falsified) -> Made:
+def _known(system: System, record: FalsifiedRecording) -> Made:
     return system, record
 
 
@@ -205,7 +205,7 @@ def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, Call
     cases = [*strong, *draw_cases(vehicle, count - len(strong), seed + 1, kinds, 1.5)]
     for number, made in enumerate(make_recordings(vehicle, cases, seconds)):
         values = in_order(system, made.values)
-        record, what = Falsified("", frozenset(), values), made.case.kind
+        record, what = FalsifiedRecording("", frozenset(), values), made.case.kind
         if what == "clean" and number < len(strong):  # the others stay healthy
             record = falsified(system, values, SETUPS[number % len(SETUPS)], random)
             what = record.kind
@@ -237,7 +237,7 @@ def quarter_car(case: QuarterCarCase, seconds: float, seed: int) -> Made:
     channels = np.column_stack([shown, sensors])
     if case.wrong is not None:
         case.wrong(channels)
-    return system, Falsified("", frozenset(), channels, sample_rate=case.rate)
+    return system, FalsifiedRecording("", frozenset(), channels, sample_rate=case.rate)
 
 
 TWO_SINES = ((0.012, 0.7, 0.3), (0.004, 1.9, 1.0))  # amplitude m, frequency Hz, phase
@@ -260,7 +260,7 @@ IMPERFECT = {
 }
 
 
-def rig(random: np.random.Generator, seconds: float, imperfect: Imperfect = Imperfect()) -> Falsified:
+def rig(random: np.random.Generator, seconds: float, imperfect: Imperfect = Imperfect()) -> FalsifiedRecording:
     """A damper with dry friction under sines."""
     t = np.arange(int(seconds * RATE)) / RATE - imperfect.late
     sines = imperfect.sines
@@ -274,10 +274,10 @@ def rig(random: np.random.Generator, seconds: float, imperfect: Imperfect = Impe
     if imperfect.late:
         t = t + imperfect.late
         d = np.sum([size * np.sin(2 * np.pi * f * t + phase) for size, f, phase in sines], axis=0)
-    return Falsified("", frozenset(), np.column_stack([d + 1e-6 * noise[0], force + 2.0 * noise[1]]))
+    return FalsifiedRecording("", frozenset(), np.column_stack([d + 1e-6 * noise[0], force + 2.0 * noise[1]]))
 
 
-def shaken(random: np.random.Generator, samples: int = 4000) -> Falsified:
+def shaken(random: np.random.Generator, samples: int = 4000) -> FalsifiedRecording:
     """Two floors under a measured force, the sensors of one floor each exchanged, springs 15 % off nominal."""
     fine, mass, H = 8, 4000.0, np.array([[1.0, 0.0], [-1.0, 1.0]])
     spectrum = np.fft.rfft(random.standard_normal(samples))
@@ -294,12 +294,12 @@ def shaken(random: np.random.Generator, samples: int = 4000) -> Falsified:
         states[i], x = x, ahead @ x + push * given
     floors = (states @ A[2:].T + np.outer(force, [0.0, 1 / mass]))[::fine]
     shown = np.column_stack([force[::fine], floors[:, 0], floors[:, 1], floors[:, 0]])  # b1 and a2 exchanged
-    return Falsified(
+    return FalsifiedRecording(
         "", frozenset(), shown + random.normal(0, 1, shown.shape) * [5, 3e-3, 3e-3, 3e-3], sample_rate=50.0
     )
 
 
-def tower(random: np.random.Generator, seconds: float = 360.0) -> Falsified:
+def tower(random: np.random.Generator, seconds: float = 360.0) -> FalsifiedRecording:
     """A tower under forces that nobody measured, one of whose springs is a tenth softer in the second half."""
     mass, fine = np.array([1000.0, 800.0]), 8
     H, damping = np.array([[1.0, 0.0], [-1.0, 1.0]]), np.array([500.0, 260.0])
@@ -319,4 +319,4 @@ def tower(random: np.random.Generator, seconds: float = 360.0) -> Falsified:
             acceleration[i] = A[2:] @ x + push[i]
             x = ahead @ x + given @ push[i]
     shown = decimate(acceleration, fine, ftype="fir", axis=0, n=20 * fine)
-    return Falsified("", frozenset(), shown + random.normal(0, 0.001, shown.shape), sample_rate=50.0)
+    return FalsifiedRecording("", frozenset(), shown + random.normal(0, 0.001, shown.shape), sample_rate=50.0)

@@ -28,7 +28,7 @@ GRAVITY = 9.80665
 
 
 @dataclass(frozen=True)
-class Wrong:
+class ChannelErrors:
     """What is wrong with the channels of a recording: their factor, delay in samples, or that they are exchanged."""
 
     effect: str  # "" : nothing
@@ -54,7 +54,7 @@ class Rig:
     file: str
     seconds: float
     drive: Callable[[int, float, np.random.Generator], Array]  # samples, their rate; input columns (T, C)
-    wrong: tuple[Wrong, ...]
+    wrong: tuple[ChannelErrors, ...]
 
 
 @dataclass
@@ -150,16 +150,16 @@ RIGS = (
         30.0,
         _roads,
         (
-            Wrong(""),
-            Wrong("sign_reversed", ("frame_front",), factor=-1),
-            Wrong("sign_reversed", _REAR, factor=-1, place="road_rear"),
-            Wrong("channels_swapped", _AXLES, exchanged=_AXLES[::-1]),
-            Wrong("channels_swapped", _FRONT + _REAR, exchanged=_REAR + _FRONT, place="road_front|road_rear"),
-            Wrong("node_delay", _FRAME, late=4),
-            Wrong("node_delay", _FRONT, late=3),
-            Wrong("node_delay", _FRONT + _REAR, late=3),
-            Wrong("node_delay", _FRAME + _AXLES, late=3),
-            Wrong("wrong_scale", _FRAME + _AXLES, factor=1 / GRAVITY),
+            ChannelErrors(""),
+            ChannelErrors("sign_reversed", ("frame_front",), factor=-1),
+            ChannelErrors("sign_reversed", _REAR, factor=-1, place="road_rear"),
+            ChannelErrors("channels_swapped", _AXLES, exchanged=_AXLES[::-1]),
+            ChannelErrors("channels_swapped", _FRONT + _REAR, exchanged=_REAR + _FRONT, place="road_front|road_rear"),
+            ChannelErrors("node_delay", _FRAME, late=4),
+            ChannelErrors("node_delay", _FRONT, late=3),
+            ChannelErrors("node_delay", _FRONT + _REAR, late=3),
+            ChannelErrors("node_delay", _FRAME + _AXLES, late=3),
+            ChannelErrors("wrong_scale", _FRAME + _AXLES, factor=1 / GRAVITY),
         ),
     ),
     Rig(
@@ -167,16 +167,16 @@ RIGS = (
         60.0,
         _table,
         (
-            Wrong(""),
-            Wrong("sign_reversed", ("a2",), factor=-1),
-            Wrong("sign_reversed", ("table.acceleration",), factor=-1, place="table"),
-            Wrong("channels_swapped", ("a1", "a3"), exchanged=("a3", "a1")),
-            Wrong("node_delay", ("table.acceleration",), late=5),
-            Wrong("node_delay", _FLOORS, late=3),
-            Wrong("wrong_scale", _FLOORS, factor=1 / GRAVITY),
-            Wrong("wrong_scale", ("table.acceleration",), factor=1 / GRAVITY),
-            Wrong("wrong_scale", ("a3",), factor=0.7),
-            Wrong("sensor_lag", ("a2",), late=3),
+            ChannelErrors(""),
+            ChannelErrors("sign_reversed", ("a2",), factor=-1),
+            ChannelErrors("sign_reversed", ("table.acceleration",), factor=-1, place="table"),
+            ChannelErrors("channels_swapped", ("a1", "a3"), exchanged=("a3", "a1")),
+            ChannelErrors("node_delay", ("table.acceleration",), late=5),
+            ChannelErrors("node_delay", _FLOORS, late=3),
+            ChannelErrors("wrong_scale", _FLOORS, factor=1 / GRAVITY),
+            ChannelErrors("wrong_scale", ("table.acceleration",), factor=1 / GRAVITY),
+            ChannelErrors("wrong_scale", ("a3",), factor=0.7),
+            ChannelErrors("sensor_lag", ("a2",), late=3),
         ),
     ),
     Rig(
@@ -184,16 +184,16 @@ RIGS = (
         30.0,
         _shaker,
         (
-            Wrong(""),
-            Wrong("sign_reversed", ("shaker",), factor=-1),
-            Wrong("sign_reversed", ("a2",), factor=-1),
-            Wrong("channels_swapped", ("a1", "a3"), exchanged=("a3", "a1")),
-            Wrong("node_delay", _ACCELERATIONS, late=3),
-            Wrong("sensor_lag", ("a2",), late=3),
-            Wrong("wrong_scale", ("shaker",), factor=1e-3),
-            Wrong("wrong_scale", _ACCELERATIONS, factor=1 / GRAVITY),
-            Wrong("sensor_gain", ("b1",), factor=1.4),
-            Wrong(""),
+            ChannelErrors(""),
+            ChannelErrors("sign_reversed", ("shaker",), factor=-1),
+            ChannelErrors("sign_reversed", ("a2",), factor=-1),
+            ChannelErrors("channels_swapped", ("a1", "a3"), exchanged=("a3", "a1")),
+            ChannelErrors("node_delay", _ACCELERATIONS, late=3),
+            ChannelErrors("sensor_lag", ("a2",), late=3),
+            ChannelErrors("wrong_scale", ("shaker",), factor=1e-3),
+            ChannelErrors("wrong_scale", _ACCELERATIONS, factor=1 / GRAVITY),
+            ChannelErrors("sensor_gain", ("b1",), factor=1.4),
+            ChannelErrors(""),
         ),
     ),
 )

@@ -42,7 +42,7 @@ SCALES = (1 / 9.80665, 9.80665, 0.1, 10.0, 1000.0, 0.5, 2.0)
 
 
 @dataclass(frozen=True)
-class Falsified:
+class FalsifiedRecording:
     """A recording with a wrong set-up: wrong channels, or a wrong system file."""
 
     kind: str
@@ -92,7 +92,7 @@ def in_order(system: System, values: Array) -> Array:
     return values[:, [made.index(channel.name) for channel in system.channels]]
 
 
-def falsified(system: System, clean: Array, kind: str, random: np.random.Generator) -> Falsified:
+def falsified(system: System, clean: Array, kind: str, random: np.random.Generator) -> FalsifiedRecording:
     """One wrong set-up of a kind."""
     values = clean.copy()
     names = [channel.name for channel in system.channels]
@@ -102,7 +102,7 @@ def falsified(system: System, clean: Array, kind: str, random: np.random.Generat
     wheels = [e.lower for e in system.file.elements.values() if e.upper == bogie]
     if kind in ("element at another body", "position of an element"):
         wrong, name = _wrong_file(system, kind, random)
-        return Falsified(kind, frozenset([name]), values, file=wrong)
+        return FalsifiedRecording(kind, frozenset([name]), values, file=wrong)
     if kind == "sign of a motion":
         chosen = [str(random.choice(list(system.file.inputs)))]
         values[:, [i for i, n in enumerate(names) if n.split(".")[0] == chosen[0]]] *= -1
@@ -126,7 +126,7 @@ def falsified(system: System, clean: Array, kind: str, random: np.random.Generat
         chosen = [str(random.choice(sensors))]
         offset = float(random.choice((-1, 1)) * random.uniform(0.5, 2.0))
         values[:, names.index(chosen[0])] = elsewhere(system, clean, names, chosen[0], offset)
-    return Falsified(kind, frozenset(chosen), values)
+    return FalsifiedRecording(kind, frozenset(chosen), values)
 
 
 def _wrong_file(system: System, kind: str, random: np.random.Generator) -> tuple[System, str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from sprung.benchmarks.trust_ride import SYSTEM_FILE, RestlessRide
-from sprung.benchmarks.trust_service import Served, audit, clients, settled
+from sprung.benchmarks.trust_service import ServiceProcess, audit, clients, settled
 from sprung.benchmarks.trust_zygote import DONE, GO, Forked, Zygote
 from sprung.service.times import to_iso
 
@@ -49,7 +49,7 @@ class ServiceKills:
         for sender in senders:
             sender.start()
         kind = rng.random()
-        with Served(self._folder / "data", self._zygote) as served:
+        with ServiceProcess(self._folder / "data", self._zygote) as served:
             if kind < 0.2:
                 delay = rng.uniform(0.0, SOON)
             else:
@@ -68,7 +68,7 @@ class ServiceKills:
     def outcome(self) -> dict[str, Any]:
         """After one more start, and the end of every job."""
         senders = clients(self._folder / "ledgers", self._ride)
-        with Served(self._folder / "data", self._zygote) as served:
+        with ServiceProcess(self._folder / "data", self._zygote) as served:
             served.ready()
             settled(served.port, senders)
             served.kill()

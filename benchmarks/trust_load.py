@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sprung.benchmarks.serve import window_body
-from sprung.benchmarks.trust_service import Served, children
+from sprung.benchmarks.trust_service import ServiceProcess, children
 from sprung.model.system import MANCHESTER, load_system
 
 VEHICLES, MOST_CONNECTIONS = 100, 100
@@ -56,7 +56,7 @@ def watched(
     """
     parts = window_body(load_system()).split(b'"bench"')
     sent, memory = LoadSent(), list[tuple[float, int]]()
-    with Served(folder, system=MANCHESTER) as served:
+    with ServiceProcess(folder, system=MANCHESTER) as served:
         served.ready()
         begun = time.monotonic() + 1.0
         ends = begun + 60 * minutes

@@ -20,7 +20,7 @@ from typing import Any
 from sprung.benchmarks.trust_clients import UPLOAD_SECONDS
 from sprung.benchmarks.trust_disk import TRACED, ForgetfulDisk, SystemCall, system_calls
 from sprung.benchmarks.trust_ride import START_SECONDS, RestlessRide
-from sprung.benchmarks.trust_service import Served, clients
+from sprung.benchmarks.trust_service import ServiceProcess, clients
 
 RUN_SECONDS = 40.0
 ACKNOWLEDGED = re.compile(rb"HTTP/1\.1 20[02] .*?x-request-id: (window|upload|diagnosis)-(\d+)\r\n", re.S | re.I)
@@ -58,7 +58,7 @@ def _record(folder: Path, log: Path, data: Path, ride: RestlessRide) -> None:
     part = log.with_suffix(".part")
     trace = ("strace", "-f", "-y", "-xx", "-s", "10000000", "--seccomp-bpf", "-e", f"trace={TRACED}", "-o", str(part))
     senders = clients(folder / "ledgers", ride)
-    with Served(data, before=trace) as served:
+    with ServiceProcess(data, before=trace) as served:
         served.ready()
         for sender in senders:
             sender.port = served.port

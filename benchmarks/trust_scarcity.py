@@ -24,7 +24,7 @@ from typing import Any
 
 from sprung.benchmarks.trust_clients import ask
 from sprung.benchmarks.trust_ride import RestlessRide
-from sprung.benchmarks.trust_service import Served
+from sprung.benchmarks.trust_service import ServiceProcess
 
 DISK_MB = 96
 BACK_SECONDS = 120.0  # within which it has to be ready again
@@ -55,7 +55,7 @@ class ScarceService:
         folder.mkdir(parents=True, exist_ok=True)
         mount = f'mount -t tmpfs -o size={DISK_MB}m tmpfs "{folder}" && exec "$@"'
         own_disk = ("unshare", "-rm", "sh", "-c", mount, "sh")
-        self.served = Served(folder, before=("env", "SPRUNG_MIN_FREE_BYTES=0", *own_disk))
+        self.served = ServiceProcess(folder, before=("env", "SPRUNG_MIN_FREE_BYTES=0", *own_disk))
         self.pid = self.served.process.pid
         self._folder = folder
         self._ride = ride

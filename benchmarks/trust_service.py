@@ -20,7 +20,7 @@ READY_SECONDS = 240.0
 SETTLE_SECONDS = 600.0
 
 
-class Served:
+class ServiceProcess:
     """A `sprung serve` in a process of its own."""
 
     def __init__(
@@ -44,7 +44,7 @@ class Served:
         )
         self.process = Forked(self._started.pid)
 
-    def __enter__(self) -> Served:
+    def __enter__(self) -> ServiceProcess:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from sprung.model.address import Address
 from sprung.model.digest import digest_of, structure_of
 from sprung.model.laws import CATALOGUE, ElementLaw, Law
-from sprung.model.laws.in_place import Follower, Whole, all_in_place, misplaced
+from sprung.model.laws.in_place import Follower, MechanicsWithLaws, all_in_place, misplaced
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, Mode, assemble
@@ -117,9 +117,9 @@ class System:
         return (*self.elements, *self._in_place.added)
 
     @cached_property
-    def _in_place(self) -> Whole:
+    def _in_place(self) -> MechanicsWithLaws:
         nominal = assemble(self.file)
-        return all_in_place(self.file, nominal, self.laws) if self.whole else Whole(nominal)
+        return all_in_place(self.file, nominal, self.laws) if self.whole else MechanicsWithLaws(nominal)
 
     @cached_property
     def whole_system(self) -> System:

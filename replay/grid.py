@@ -39,7 +39,7 @@ LONGEST_REPAIR = REACH - NEIGHBOURS  # consecutive samples
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class GridSamples:
     """Samples on R grid rows of C channels, before any repair."""
 
     value: FloatArray  # (R, C); NaN where no valid sample is
@@ -48,7 +48,7 @@ class Placed:
     phase: FloatArray  # (R, 2) sum of cos, sin of 2 pi offset: the common phase of the samples near a row
 
 
-def place(offset: FloatArray, channel: NDArray[np.int32], value: FloatArray, rows: int, channels: int) -> Placed:
+def place(offset: FloatArray, channel: NDArray[np.int32], value: FloatArray, rows: int, channels: int) -> GridSamples:
     """Put samples on their nearest rows; `offset` counts grid periods from row 0, shape (n,)."""
     row: IntArray = np.rint(offset).astype(np.int64)
     inside = (row >= 0) & (row < rows)
@@ -68,7 +68,7 @@ def place(offset: FloatArray, channel: NDArray[np.int32], value: FloatArray, row
         [np.bincount(row, part, rows) for part in (np.cos(angle), np.sin(angle))], axis=1, dtype=np.float64
     )
     shape = (rows, channels)
-    return Placed(grid.reshape(shape), off_grid.reshape(shape), conflict.reshape(shape), phase)
+    return GridSamples(grid.reshape(shape), off_grid.reshape(shape), conflict.reshape(shape), phase)
 
 
 @dataclass(frozen=True, slots=True)

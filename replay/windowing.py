@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
-from sprung.replay.grid import REACH, SLOWEST, Placed, Resampled, by_count, fill, place, resample, uneven
+from sprung.replay.grid import REACH, SLOWEST, GridSamples, Resampled, by_count, fill, place, resample, uneven
 from sprung.replay.stream import ClockJump, Reorderer
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
@@ -207,7 +207,7 @@ class _Batch:
         self.offset: FloatArray = np.asarray((elapsed - self.origin) / owner._period + self.before, dtype=np.float64)
         self.samples = samples
         channels = len(owner.channels)
-        self.placed: Placed = place(self.offset, samples.channel, samples.value, self.rows, channels)
+        self.placed: GridSamples = place(self.offset, samples.channel, samples.value, self.rows, channels)
         self.starts = self.before + owner.hop * np.arange(count)
         self.ends = self.starts + owner.window
         self.filled = fill(self.placed.value, owner.longest_gap)

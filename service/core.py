@@ -37,7 +37,7 @@ from sprung.service.monitoring.ring import Rings
 from sprung.service.monitoring.views import VehicleView, vehicle_view
 from sprung.service.notify.notices import Notices
 from sprung.service.observability.metrics import Metrics
-from sprung.service.observability.queues import Waits
+from sprung.service.observability.queues import WaitMetrics
 from sprung.service.observability.vitals import Vitals, request_histogram
 from sprung.service.operations import Operations
 from sprung.service.settings import Settings
@@ -79,7 +79,7 @@ class Core:
     ingest: Ingest
     statistics: FleetStatistics
     upload_room: UploadRoom
-    waits: Waits
+    waits: WaitMetrics
     archive: Archive | None = None
     oidc: Provider | None = None  # where people sign in beside their tokens
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
@@ -124,7 +124,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
     store, archive = open_store(settings.store_url), open_archive(settings.archive)
     board = Board(engine, settings.vehicles_in_memory)
     metrics = Metrics(board, settings.parameter_series_vehicles, partial(fleet_counts, store))
-    waits = Waits(metrics.registry)
+    waits = WaitMetrics(metrics.registry)
     store.on_wait = waits.of("store")
     feeds: list[LiveFeed] = []
     notices = Notices(settings, store, lambda: [feed.status() for feed in feeds])
@@ -203,7 +203,9 @@ def _observed(core: Core) -> Core:
     return core
 
 
-def _jobs(settings: Settings, pipeline: Pipeline, metrics: Metrics, diagnosis: DiagnosisJobs, waits: Waits) -> Jobs:
+def _jobs(
+    settings: Settings, pipeline: Pipeline, metrics: Metrics, diagnosis: DiagnosisJobs, waits: WaitMetrics
+) -> Jobs:
     """The queue of jobs, with what runs each kind and how long it may take."""
     recordings = RecordingJobs(settings, pipeline, lambda: tally_counter(metrics, "upload"))
     kinds = {
@@ -250,4 +252,4 @@ def stored_views(core: Core) -> list[tuple[VehicleView, int]]:
 def fleet_counts(store: Store) -> dict[str, int]:
     """Vehicles in service by health."""
     with store.read() as connection:
-        return status.health_counts(connection, status.Wanted())
+        return status.health_counts(connection, status.StatusFilter())

@@ -126,7 +126,7 @@ class Housekeeping:
             log.warning("%d files that were left half written are deleted", len(left))
         return [path.name for path in left]
 
-    def once(self, now: int, keep: bool = True) -> retention.Forgotten:
+    def once(self, now: int, keep: bool = True) -> retention.RetentionResult:
         """One round, as if it were `now`, ns since epoch; keep: False only lists what would be deleted."""
         settings = self._settings
         limits = retention.RetentionLimits(

@@ -31,14 +31,14 @@ from sprung.service.monitoring.engine import load_engine
 from sprung.service.monitoring.numerics import numerics
 from sprung.service.processes.worker import ProcessLimits
 from sprung.service.settings import Settings
-from sprung.service.sources.feed import Fed, OnBatch, feed_file, vehicle_of
+from sprung.service.sources.feed import FeedResult, OnBatch, feed_file, vehicle_of
 from sprung.service.sources.live import LiveFeed
 from sprung.service.store import open_store
 from sprung.service.store.work import add_recording
 
 log = logging.getLogger("sprung")
 
-Watch = Callable[[Path, Core], "tuple[OnBatch, Callable[[Fed], None]]"]
+Watch = Callable[[Path, Core], "tuple[OnBatch, Callable[[FeedResult], None]]"]
 
 
 @dataclass(frozen=True, slots=True)

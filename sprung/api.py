@@ -24,7 +24,7 @@ from sprung.replay.record import Record
 from sprung.replay.recording import Recording
 from sprung.service.can_database import database_of
 from sprung.service.monitoring.engine import Engine, make_tracker
-from sprung.service.monitoring.following import Followed
+from sprung.service.monitoring.following import FollowedVehicle
 from sprung.service.report import write_report
 from sprung.service.sources.opening import open_record, open_stream
 from sprung.service.sources.reading import windower_of
@@ -199,7 +199,7 @@ def track(system: System, recording: Recording, model: Identifies | None = None)
     ('primary_11l.stiffness', True, True)
     """
     engine = Engine(system, model or load_identifier(system), make_tracker(system))
-    followed, count = Followed(engine.tracker.initial_state()), 0
+    followed, count = FollowedVehicle(engine.tracker.initial_state()), 0
     for windows in _cut(system, recording):
         whole = [window for window in windows if window.outcome != "dropped"]
         estimates: Iterator[Estimate] = iter(())

@@ -26,7 +26,7 @@ class Likelihood(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Fitted:
+class PosteriorFit:
     """The maximum a posteriori point and its covariance."""
 
     x: FloatArray  # shape (P + Q,)
@@ -37,7 +37,9 @@ class Fitted:
     iterations: int
 
 
-def fit(likelihood: Likelihood, x: FloatArray, prior: Prior, free: BoolArray | None = None, limit: int = 40) -> Fitted:
+def fit(
+    likelihood: Likelihood, x: FloatArray, prior: Prior, free: BoolArray | None = None, limit: int = 40
+) -> PosteriorFit:
     """Scoring from `x` with a Gaussian prior; values that are not `free` are fixed and count as known."""
     chosen = np.flatnonzero(np.ones(len(x), dtype=bool) if free is None else free)
     precision = prior.std[chosen] ** -2.0
@@ -68,7 +70,7 @@ def fit(likelihood: Likelihood, x: FloatArray, prior: Prior, free: BoolArray | N
     information = at.information[np.ix_(chosen, chosen)] + np.diag(precision)
     covariance = np.zeros((len(x), len(x)))
     covariance[np.ix_(chosen, chosen)] = _inverse(information)
-    return Fitted(x, covariance, at, float(cost), converged, iterations)
+    return PosteriorFit(x, covariance, at, float(cost), converged, iterations)
 
 
 def _penalty(x: FloatArray, prior: Prior) -> float:

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import norm
 
 from sprung.model.ambient.excitation import Prior
-from sprung.model.ambient.fit import Fitted, fit
+from sprung.model.ambient.fit import PosteriorFit, fit
 from sprung.model.ambient.response import Response, Responses
 from sprung.model.ambient.sensing import Sensing, sensing
 from sprung.model.ambient.whittle import Evaluation, adjoint
@@ -49,7 +49,9 @@ USUAL = 2.5  # standard deviations that the worst part of a good fit leaves its 
 class TransientFit:
     """Fit of one window."""
 
-    fitted: Fitted  # x: log-ratios, log-levels of the forces' power, logarithm of the noise power over the declared
+    fitted: (
+        PosteriorFit  # x: log-ratios, log-levels of the forces' power, logarithm of the noise power over the declared
+    )
     frequency: FloatArray  # of the compared bins, Hz, shape (F,)
     whole: FloatArray  # power of every sensor's bins, shape (F, S)
     rest: FloatArray  # of it without the transients of the ends, shape (F, S)
@@ -186,7 +188,7 @@ class TransientWindow:
         omega: FloatArray,
         start: FloatArray | None,
         known: FloatArray | None,
-    ) -> Fitted:
+    ) -> PosteriorFit:
         responses = Responses(self.system, sensed)
         likelihood = TransientLikelihood(responses, signals, omega)
         P, n = likelihood.P, likelihood.n
@@ -232,7 +234,7 @@ class TransientWindow:
         return found
 
 
-def _judged(fitted: Fitted, frequency: FloatArray, whole: FloatArray, sensed: Sensing) -> TransientFit:
+def _judged(fitted: PosteriorFit, frequency: FloatArray, whole: FloatArray, sensed: Sensing) -> TransientFit:
     """How well the power in parts of the band is the expected one."""
     at = fitted.at
     white = np.einsum("frr->fr", at.whitened).real

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.ambient.excitation import Excitation, Prior
-from sprung.model.ambient.fit import Fitted, fit
+from sprung.model.ambient.fit import PosteriorFit, fit
 from sprung.model.ambient.periodogram import Spectra, spectra
 from sprung.model.ambient.response import Responses
 from sprung.model.ambient.sensing import Sensing
@@ -33,7 +33,7 @@ LOAD_STD = 0.3  # of a body's mass that varies, where the file states no range
 class AmbientFit:
     """Fit of one window: P unknowns, and Q free values of the excitation."""
 
-    fitted: Fitted
+    fitted: PosteriorFit
     spectra: Spectra
     chi_square: float  # mean square of the whitened periodograms about one, over its expectation; 1 where all is right
     chi_std: float  # its standard deviation where all is right
@@ -108,7 +108,7 @@ class WindowFit:
         excitation: Excitation,
         start: FloatArray | None = None,
         blurs: tuple[float, ...] = (*BLURS, 0.0),
-    ) -> Fitted:
+    ) -> PosteriorFit:
         """From `start` (the first of all unknowns and free numbers), or nominal values and what the sensors' power
         shows about the excitation."""
         responses = Responses(self.system, sensed, self.loads)
@@ -127,7 +127,7 @@ class WindowFit:
             x = fitted.x
         return fitted
 
-    def judged(self, fitted: Fitted, found: Spectra, sensed: Sensing) -> AmbientFit:
+    def judged(self, fitted: PosteriorFit, found: Spectra, sensed: Sensing) -> AmbientFit:
         """A fit with its goodness of fit."""
         whitened = fitted.at.whitened
         size, spares = whitened.shape[1], len(sensed.spare)
@@ -156,7 +156,7 @@ class WindowFit:
         return np.asarray(np.maximum(measured - 1, 0.05 * measured).sum(axis=1) / expected)
 
 
-def _noise_share(fitted: Fitted, found: Spectra, sensed: Sensing) -> FloatArray:
+def _noise_share(fitted: PosteriorFit, found: Spectra, sensed: Sensing) -> FloatArray:
     """Share of every sensor's rms that the model takes for noise, (S,): the residual of the most likely motion."""
     left = sensed.rows.T @ np.linalg.inv(fitted.at.covariance) @ sensed.rows + sensed.spare.T @ sensed.spare
     left = sensed.noise[:, None] ** 2 * left  # R S^-1, (F, S, S)

@@ -43,7 +43,7 @@ _SLIGHT = 0.1  # of what a data sheet leaves open; less is not taken back
 
 
 @dataclass(slots=True)
-class Explained:
+class FaultExplanation:
     """What was found for the windows that did not fit, one entry per window."""
 
     refined: Refined  # of the corrected window
@@ -103,19 +103,23 @@ class Explainer:
                 rows.append(together)
         return np.array(rows)
 
-    def again(self, windows: FloatArray, known: Mapping[int, tuple[MeasurementFault, ...]]) -> dict[int, Explained]:
+    def again(
+        self, windows: FloatArray, known: Mapping[int, tuple[MeasurementFault, ...]]
+    ) -> dict[int, FaultExplanation]:
         """Explanations of windows of a batch (B, T, C) by the faults that earlier windows of their vehicles had.
 
         known: these faults, by window.  A window that does not show them, or does not fit with them put right, is left
         out: what is wrong with it must be looked for anew.
         """
-        found: dict[int, Explained] = {}
+        found: dict[int, FaultExplanation] = {}
         for faults in set(known.values()):
             rows = np.array([b for b, theirs in known.items() if theirs == faults], dtype=np.int64)
             found |= self._again(windows, rows, faults)
         return found
 
-    def _again(self, windows: FloatArray, rows: IntArray, faults: tuple[MeasurementFault, ...]) -> dict[int, Explained]:
+    def _again(
+        self, windows: FloatArray, rows: IntArray, faults: tuple[MeasurementFault, ...]
+    ) -> dict[int, FaultExplanation]:
         """The same for the windows `rows`, of which all are known to have these faults."""
         stuck = {f.channel for f in faults if f.kind in STUCK}
         turned = tuple(f for f in faults if f.kind not in STUCK)
@@ -136,12 +140,12 @@ class Explainer:
         explained = self._by_steps(restored[agree], [causes[i] for i in agree])
         return {int(rows[agree[i]]): e for i, e in explained.items()}
 
-    def contradictory(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
+    def contradictory(self, windows: FloatArray, bad: IntArray) -> dict[int, FaultExplanation]:
         """Explanations, by index, of those of the windows `bad` of a batch (B, T, C) whose redundant channels
         contradict each other until an exchange, or a reversed sign, is undone."""
         ends = {int(b): self.contradictions.ended_by(windows[b]) for b in bad if not self.stuck.channels(windows[b])}
         left = [b for b, candidates in ends.items() if candidates]
-        found: dict[int, Explained] = {}
+        found: dict[int, FaultExplanation] = {}
         while left:
             ((most, _),) = Counter(c for b in left for c in ends[b]).most_common(1)
             alike = [b for b in left if most in ends[b]]
@@ -151,7 +155,7 @@ class Explainer:
             left = [b for b in left if b not in alike]
         return found
 
-    def _rearranged(self, windows: FloatArray, candidates: Sequence[Rearrangement]) -> list[Explained]:
+    def _rearranged(self, windows: FloatArray, candidates: Sequence[Rearrangement]) -> list[FaultExplanation]:
         """Windows (B, T, C) with the candidate undone with which they fit best.
 
         Where several fit equally well, one fault of all their channels, and the windows are refined without these.
@@ -173,7 +177,7 @@ class Explainer:
         refined = self.refiner(self.samples).refine(restored, start, loads=along, built=along, iterations=ITERATIONS)
         return np.asarray((refined.chi_square * refined.freedom).reshape(len(candidates), -1).sum(axis=1))
 
-    def explain(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
+    def explain(self, windows: FloatArray, bad: IntArray) -> dict[int, FaultExplanation]:
         """Explanations of the windows `bad` of a batch (B, T, C), by index; those without one are left out."""
         found = self._explain(windows[bad[:TRIED]], bad[:TRIED])
         common = self._common(found)
@@ -194,7 +198,7 @@ class Explainer:
     def _key(self, point: FloatArray) -> tuple[int, ...]:
         return tuple(int(h) for h in np.flatnonzero(point[: 2 * self.channels]))
 
-    def _common(self, found: dict[int, Explained]) -> FloatArray | None:
+    def _common(self, found: dict[int, FaultExplanation]) -> FloatArray | None:
         """The deviations that most of the explained windows have in common, at their median; None: there are none."""
         plain = [e.point for e in found.values() if self._key(e.point)]
         keys = [self._key(point) for point in plain]
@@ -203,7 +207,7 @@ class Explainer:
             return None
         return np.asarray(np.median([p for p, key in zip(plain, keys, strict=True) if key == most], axis=0))
 
-    def _together(self, found: dict[int, Explained]) -> FloatArray | None:
+    def _together(self, found: dict[int, FaultExplanation]) -> FloatArray | None:
         """Gains and delays as the explained windows of a batch say them together; None: fewer than two do."""
         plain = [e for e in found.values() if self._key(e.point)]
         if len(plain) < 2:
@@ -217,7 +221,7 @@ class Explainer:
         point = np.where(self._measured, np.linalg.solve(total, pull), 0.0)
         return np.where(np.abs(point) > _SLIGHT * self._std, point, 0.0)
 
-    def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, Explained]:
+    def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, FaultExplanation]:
         stuck = [self.stuck.channels(window) for window in windows]
         plain = np.array([i for i, faults in enumerate(stuck) if not faults], dtype=np.int64)
         found = {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
@@ -244,10 +248,10 @@ class Explainer:
         start: FloatArray | None = None,
         *,
         clocks: bool = False,
-    ) -> dict[int, Explained]:
+    ) -> dict[int, FaultExplanation]:
         """One deviation at a time, the one with the most evidence, or all `clocks` together; `known`: faults that were
         corrected before."""
-        found: dict[int, Explained] = {}
+        found: dict[int, FaultExplanation] = {}
         active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.deviations)))
         if start is not None:
             point[:, : 2 * self.channels] = start[: 2 * self.channels]
@@ -261,7 +265,9 @@ class Explainer:
                 step = self._clock_step(*weight) if clocks else self._step(*weight)[0]
                 good = bool(fits(one)[0])
                 if good:
-                    found[int(i)] = Explained(one, self._with_load(point[i], one), (*known[i], *self._named(point[i])))
+                    found[int(i)] = FaultExplanation(
+                        one, self._with_load(point[i], one), (*known[i], *self._named(point[i]))
+                    )
                 if self.apart(*weight) if good else chi_square < _BETTER * before[i]:
                     before[i] = chi_square
                     point[i] = self._moved(point[i], step)
@@ -350,7 +356,7 @@ class Explainer:
     def _named(self, point: FloatArray) -> tuple[MeasurementFault, ...]:
         return named(self.deviations, point, np.zeros(len(point)), np.abs(point) > 0)
 
-    def _without(self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]]) -> list[Explained]:
+    def _without(self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]]) -> list[FaultExplanation]:
         """Windows (B, T, C) without the sensors that the faults of each name; a stuck input is named, though not
         corrected."""
         without, sensible = windows.copy(), []
@@ -363,17 +369,22 @@ class Explainer:
         return self._or_as_they_are(windows, faults, {sensible[i]: e for i, e in explained.items()})
 
     def _or_as_they_are(
-        self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]], explained: dict[int, Explained]
-    ) -> list[Explained]:
+        self,
+        windows: FloatArray,
+        faults: Sequence[tuple[MeasurementFault, ...]],
+        explained: dict[int, FaultExplanation],
+    ) -> list[FaultExplanation]:
         """Explanations of windows (B, T, C), by index; for those without one, what is wrong though it is not
         corrected."""
         left = [b for b in range(len(windows)) if b not in explained]
         point = np.zeros((len(left), len(self.deviations)))
         refined = self._refined(windows[left], point, np.zeros(len(left), dtype=bool))
-        as_they_are = {b: Explained(one, at, faults[b], False) for b, one, at in zip(left, refined, point, strict=True)}
+        as_they_are = {
+            b: FaultExplanation(one, at, faults[b], False) for b, one, at in zip(left, refined, point, strict=True)
+        }
         return [explained.get(b) or as_they_are[b] for b in range(len(windows))]
 
-    def _turned(self, window: FloatArray) -> Explained | None:
+    def _turned(self, window: FloatArray) -> FaultExplanation | None:
         """One window (T, C) with a reversed or two exchanged channels put right."""
         for restored, fault in self._reversed(window):
             explained = self._by_steps(restored[None], [(fault,)])
@@ -381,7 +392,7 @@ class Explainer:
                 return explained[0]
         return None
 
-    def _late(self, window: FloatArray) -> Explained | None:
+    def _late(self, window: FloatArray) -> FaultExplanation | None:
         """One window with a channel, or all of a clock, that is late or early by many samples put right."""
         C = self.channels
         rows = [row for row in self.directions if row[C : 2 * C].any()]

@@ -16,7 +16,7 @@ from sprung.model.identification.deviations import deviations
 from sprung.model.identification.estimates import EXCITED, estimates
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.faults import Explained, Explainer
+from sprung.model.identification.faults import Explainer, FaultExplanation
 from sprung.model.identification.linearise import PRIOR_STD, prior_std
 from sprung.model.identification.model_uncertainty import ModelUncertainty, model_uncertainty
 from sprung.model.identification.refine import Refined, Refiner, Refines
@@ -121,7 +121,7 @@ class Identifier:
 
     def _explained_beforehand(
         self, windows: FloatArray, known: Sequence[tuple[MeasurementFault, ...]], explainer: Explainer
-    ) -> tuple[dict[int, Explained], BoolArray]:
+    ) -> tuple[dict[int, FaultExplanation], BoolArray]:
         """Windows, by index, with the faults that their vehicle had before or with redundant channels that contradict
         each other, put right; and which windows contain such a contradiction, (B,)."""
         moved = self._refiner(windows.shape[1]).model.excitation(windows) > EXCITED
@@ -146,7 +146,7 @@ class Identifier:
         refined = self._refiner(windows.shape[1]).refine(windows, start, loads=loads, built=built, weigh=weigh)
         return self._estimates(refined, False), estimating
 
-    def _restored(self, cause: Explained) -> Estimate:
+    def _restored(self, cause: FaultExplanation) -> Estimate:
         """The estimate of a window whose measurements were put right."""
         (restored,) = self._estimates(cause.refined, False, cause.point)
         fitting, known = restored.adequate and cause.corrected, restored.identified or bool(cause.faults)

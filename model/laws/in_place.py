@@ -62,7 +62,7 @@ def misplaced(file: SystemFile, mechanics: Mechanics, laws: Sequence[PlacedLaw])
 
 
 @dataclass(frozen=True, slots=True)
-class Whole:
+class MechanicsWithLaws:
     """The mechanics with all linear laws."""
 
     mechanics: Mechanics
@@ -70,7 +70,7 @@ class Whole:
     followers: tuple[Follower, ...] = ()  # of their values that are positive and not fixed
 
 
-def all_in_place(file: SystemFile, mechanics: Mechanics, laws: Sequence[PlacedLaw]) -> Whole:
+def all_in_place(file: SystemFile, mechanics: Mechanics, laws: Sequence[PlacedLaw]) -> MechanicsWithLaws:
     """The mechanics with all linear laws.  Errors: `LawError`."""
     found: list[Follower] = []
     added: list[str] = []
@@ -81,7 +81,7 @@ def all_in_place(file: SystemFile, mechanics: Mechanics, laws: Sequence[PlacedLa
             if len(mechanics.stiffness) > before:
                 added.append(f"{placed.location}.{placed.law.name}")
             found += _followers(file, placed, len(mechanics.stiffness) - 1)
-    return Whole(mechanics, tuple(added), tuple(found))
+    return MechanicsWithLaws(mechanics, tuple(added), tuple(found))
 
 
 def _followers(file: SystemFile, placed: PlacedLaw, added: int) -> Iterator[Follower]:

@@ -14,7 +14,7 @@ from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
 from sprung.service.api.bodies import LINE_PATTERN, TEXT_PATTERN, StrictBody
 from sprung.service.api.fleet import vehicle_answer
-from sprung.service.api.idempotency import Once, OnceOf
+from sprung.service.api.idempotency import IdempotentRequests, OnceOf
 from sprung.service.api.problems import ApiProblem
 from sprung.service.api.queries import Id, Limit
 from sprung.service.store import fleet, marks
@@ -154,7 +154,7 @@ def mark_dict(row: MarkRow) -> dict[str, Any]:
     }
 
 
-async def _once(once: Once, act: Any) -> Response:
+async def _once(once: IdempotentRequests, act: Any) -> Response:
     answer: Response = await once.answer(act)
     return answer
 

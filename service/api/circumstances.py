@@ -11,7 +11,7 @@ from sprung.service.api.circumstance_models import CircumstancesAnswer
 from sprung.service.api.queries import FOREVER, Id, Since, Until, time_of
 from sprung.service.monitoring.views import UNITS
 from sprung.service.store import fleet
-from sprung.service.store.circumstances import RanSeries, circumstances_between
+from sprung.service.store.circumstances import CircumstanceSeries, circumstances_between
 
 router = APIRouter(tags=["vehicles"])
 MOST_POINTS = 2000
@@ -26,7 +26,7 @@ async def circumstances(core: CoreOf, id_: Id, since: Since = None, until: Until
     they are measured, with since <= time < until, oldest first."""
     start, end = time_of("since", since, 0), time_of("until", until, FOREVER)
 
-    def query(connection: Connection) -> RanSeries:
+    def query(connection: Connection) -> CircumstanceSeries:
         known_vehicle(fleet.vehicle_exists(connection, id_), id_)
         return circumstances_between(connection, id_, start, end, MOST_POINTS)
 

@@ -14,7 +14,7 @@ from sprung.service.access.tokens import Actor
 from sprung.service.api import job_models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, note, own_vehicle, read
 from sprung.service.api.bodies import DiagnoseBody
-from sprung.service.api.idempotency import Once, OnceOf
+from sprung.service.api.idempotency import IdempotentRequests, OnceOf
 from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.api.recordings import job_dict
 from sprung.service.api.scopes import FORM, content_kind
@@ -106,7 +106,7 @@ async def report_system(core: CoreOf, actor: ActorOf, id: str) -> Response:
     return Response(text, media_type="application/yaml", headers=named)
 
 
-async def _of_upload(request: Request, core: Core, actor: Actor, once: Once) -> JobRow:
+async def _of_upload(request: Request, core: Core, actor: Actor, once: IdempotentRequests) -> JobRow:
     async with receive(request, core) as found:
         once.received(found.identity)
         own_vehicle(actor, found.vehicle)

@@ -16,7 +16,7 @@ from sprung.service.monitoring.engines import ServedModel
 from sprung.service.monitoring.views import VehicleView, alarm_dict, vehicle_view
 from sprung.service.store import fleet, status
 from sprung.service.store.fleet import WantedAlarms
-from sprung.service.store.status import FleetRow, Sort, Wanted
+from sprung.service.store.status import FleetRow, Sort, StatusFilter
 from sprung.service.store.windows import latest_window
 from sprung.service.times import NANOSECONDS, now_ns, optional_iso, to_iso
 
@@ -38,7 +38,7 @@ async def vehicles(
     retired: Annotated[bool, Query(description="those out of service instead")] = False,
 ) -> Response:
     """A page of vehicles; `next` is the `after` of the following page, null at the end."""
-    wanted = Wanted(q, health, silent_before(core) if silent else None, acknowledged, retired, actor.fleet)
+    wanted = StatusFilter(q, health, silent_before(core) if silent else None, acknowledged, retired, actor.fleet)
 
     def query(connection: Connection) -> dict[str, Any]:
         begin = after

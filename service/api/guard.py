@@ -24,7 +24,7 @@ from sprung.service.access.oidc import AGAIN_SECONDS, Provider, Unreachable, loo
 from sprung.service.access.tokens import Actor, Refused, Tokens, digest_of
 from sprung.service.api.clients import client_of
 from sprung.service.api.problems import ApiProblem, problem_page, problem_response, wants_page
-from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, content_kind, need_of, place_of
+from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, RequiredScope, content_kind, need_of, place_of
 from sprung.service.observability.logs import request_id
 from sprung.service.rendering.render import signed_in
 from sprung.service.settings import Settings
@@ -151,7 +151,7 @@ class Guard:
         """Whether requests need a token."""
         return not self._settings.open and (not self._local or self._oidc is not None or self._tokens.any)
 
-    async def _who(self, scope: Scope, headers: Headers, need: Need) -> tuple[Actor, bool]:
+    async def _who(self, scope: Scope, headers: Headers, need: RequiredScope) -> tuple[Actor, bool]:
         """The actor of a request, and whether a browser authenticates by itself (cookie, or no sign-in); counted.
 
         Requests of somebody count as his, all others as their address's, and before anything is looked up: whoever
@@ -228,7 +228,7 @@ class Guard:
         if host != self._settings.host and not await run_in_threadpool(lambda: self.required):
             raise ApiProblem(421, "this host name is not served without tokens; allow it with SPRUNG_ALLOWED_HOSTS")
 
-    def _check_browser(self, scope: Scope, headers: Headers, need: Need, by_cookie: bool) -> None:
+    def _check_browser(self, scope: Scope, headers: Headers, need: RequiredScope, by_cookie: bool) -> None:
         """Against pages of others that make a browser send: they cannot send a token, and they cannot hide."""
         if scope["method"] not in UNSAFE:
             return
@@ -248,7 +248,7 @@ class Guard:
         if headers.get("content-encoding", "identity").strip().lower() != "identity":
             raise ApiProblem(415, "send the body as it is, not compressed", headers={"Accept-Encoding": "identity"})
 
-    def _check_scope(self, actor: Actor, need: Need, path: str) -> None:
+    def _check_scope(self, actor: Actor, need: RequiredScope, path: str) -> None:
         if need.scope and not actor.may(need.scope):
             raise ApiProblem(
                 403, f"this needs the scope `{need.scope}`; the token has {', '.join(sorted(actor.scopes))}"

@@ -34,7 +34,7 @@ _running: set[str] = set()
 _lock = threading.Lock()
 
 
-class Once:
+class IdempotentRequests:
     """Carries a request out unless an answer to its key is there."""
 
     def __init__(self, core: Core, key: str | None, request: Request, parts: list[bytes]) -> None:
@@ -98,16 +98,16 @@ class Once:
             insert_or_ignore(connection, idempotency, [row])
 
 
-async def once(request: Request, core: CoreOf, actor: ActorOf, key: Key = None) -> Once:
+async def once(request: Request, core: CoreOf, actor: ActorOf, key: Key = None) -> IdempotentRequests:
     """What a route needs to be carried out once; JSON bodies count as part of the request."""
     body = await request.body() if key is not None and content_kind(request.headers) == "application/json" else b""
     if key is not None:
         key = _digest(*(part.encode() for part in (actor.name, actor.fleet, *sorted(actor.scopes), key)))
-    return Once(core, key, request, [request.method.encode(), request.url.path.encode(), body])
+    return IdempotentRequests(core, key, request, [request.method.encode(), request.url.path.encode(), body])
 
 
 def _digest(*parts: bytes) -> str:
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
 
-OnceOf = Annotated[Once, Depends(once)]
+OnceOf = Annotated[IdempotentRequests, Depends(once)]

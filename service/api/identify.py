@@ -19,7 +19,7 @@ from sprung.service.core import Core
 from sprung.service.monitoring.batching import AskedWindow
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.views import fit_dict, physical, sensor_dict
-from sprung.service.store.windows import Solved
+from sprung.service.store.windows import StoredEstimate
 from sprung.service.times import NANOSECONDS, now_ns
 
 router = APIRouter(tags=["identify"])
@@ -81,7 +81,7 @@ def _needed(vehicle: str | None) -> None:
 
 
 def _answer(engine: Engine, vehicle: str | None, estimate: Estimate) -> dict[str, Any]:
-    solved = Solved.of(estimate)
+    solved = StoredEstimate.of(estimate)
     answer: dict[str, Any] = {
         "vehicle": vehicle,
         "model": engine.digest,

@@ -23,7 +23,7 @@ from sprung.service.api.guard import Guard
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.problems import ApiProblem
 from sprung.service.errors import Busy
-from sprung.service.fleet.ingest import OtherModel, Taken, read_messages
+from sprung.service.fleet.ingest import IngestResult, OtherModel, read_messages
 from sprung.service.fleet.message import SentWindows
 from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
@@ -36,10 +36,10 @@ _ID: TypeAdapter[str] = TypeAdapter(VehicleId)
 class Behind(Protocol):
     """Who does the work.  Raises Busy when too much waits."""
 
-    async def fold(self, body: bytes) -> Taken:
+    async def fold(self, body: bytes) -> IngestResult:
         """Fold a message of estimates; it is stored when this returns."""
 
-    async def identify_and_fold(self, sent: SentWindows) -> Taken:
+    async def identify_and_fold(self, sent: SentWindows) -> IngestResult:
         """Identify windows and fold their estimates."""
 
 
@@ -99,7 +99,7 @@ def _check_id(vehicle: str) -> None:
         raise ApiProblem(422, "vehicle: letters, digits and . _ : - only, at most 128") from None
 
 
-def _answer(taken: Taken) -> Response:
+def _answer(taken: IngestResult) -> Response:
     return json_response(
         {"vehicle": taken.vehicle, "folded": taken.folded, "waiting": taken.waiting, "known": taken.known}
     )

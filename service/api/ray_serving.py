@@ -21,7 +21,7 @@ import numpy as np
 from sprung.model.signals import Estimate, FloatArray
 from sprung.service.api.live_ingest import ingest_app
 from sprung.service.errors import Busy, UserError
-from sprung.service.fleet.ingest import Taken, read_messages
+from sprung.service.fleet.ingest import IngestResult, read_messages
 from sprung.service.fleet.message import Message, SentWindows, WindowEstimate
 from sprung.service.fleet.ray_head import RayHead
 from sprung.service.fleet.ray_replicas import FoldReplica, IdentifyReplica
@@ -69,12 +69,12 @@ class RayBehind:
         self._identified = batch(max_batch_size=sizes.batch_windows, **wait)(self._identify_together)
         self._folded = batch(max_batch_size=sizes.batch_messages, **wait)(self._fold_together)
 
-    async def fold(self, body: bytes) -> Taken:
+    async def fold(self, body: bytes) -> IngestResult:
         """Fold a message."""
         with self._place():
             return await self._fold_one((await asyncio.to_thread(read_messages, [body]))[0])
 
-    async def identify_and_fold(self, sent: SentWindows) -> Taken:
+    async def identify_and_fold(self, sent: SentWindows) -> IngestResult:
         """Identify windows, together with those of others, and fold them together."""
         with self._place():
             ways = [self._identified(one) for one in zip(sent.starts, sent.values, strict=True)]
@@ -94,8 +94,8 @@ class RayBehind:
         finally:
             self._waiting -= 1
 
-    async def _fold_one(self, message: Message) -> Taken:
-        taken: Taken | UserError = await self._folded(message)
+    async def _fold_one(self, message: Message) -> IngestResult:
+        taken: IngestResult | UserError = await self._folded(message)
         if isinstance(taken, UserError):
             raise taken
         return taken
@@ -105,8 +105,8 @@ class RayBehind:
         found: list[Estimate] = await _asked(self._identify.identify.remote(starts, values))
         return found
 
-    async def _fold_together(self, messages: list[Message]) -> list[Taken | UserError]:
-        found: list[Taken | UserError] = await _asked(self._fold.fold.remote(messages))
+    async def _fold_together(self, messages: list[Message]) -> list[IngestResult | UserError]:
+        found: list[IngestResult | UserError] = await _asked(self._fold.fold.remote(messages))
         return found
 
 

@@ -12,7 +12,7 @@ PUBLIC = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Need:
+class RequiredScope:
     """What a request needs."""
 
     scope: str  # PUBLIC: nothing
@@ -30,47 +30,49 @@ def content_kind(headers: Mapping[str, str]) -> str:
 
 
 # /health/live costs nothing, and who watches the service must hear that it lives, whatever else comes from its address
-NEEDS: dict[tuple[str, str], Need] = {
-    ("GET", "/health/live"): Need(PUBLIC, limited=False),
-    ("GET", "/health/ready"): Need(PUBLIC),
-    ("GET", "/signin"): Need(PUBLIC),
-    ("POST", "/signin"): Need(PUBLIC, body=("application/x-www-form-urlencoded",)),
-    ("GET", "/signin/oidc"): Need(PUBLIC),
-    ("GET", "/signin/oidc/callback"): Need(PUBLIC),
-    ("POST", "/signout"): Need(PUBLIC, body=("application/x-www-form-urlencoded",)),
-    ("GET", "/static/{path}"): Need(PUBLIC),
-    ("GET", "/favicon.ico"): Need(PUBLIC),
-    ("GET", "/docs"): Need("read", by_fleet=True),
-    ("GET", "/openapi.json"): Need("read", by_fleet=True),
-    ("POST", "/identify"): Need("ingest", by_fleet=True),
-    ("POST", "/ingest/estimates"): Need("ingest", by_fleet=True, body=(MEDIA_TYPE, "application/octet-stream")),
-    ("POST", "/ingest/windows"): Need("ingest", by_fleet=True),
-    ("POST", "/recordings"): Need("ingest", by_fleet=True, body=(FORM,)),
-    ("POST", "/diagnose"): Need("operate", by_fleet=True, body=("application/json", FORM)),
-    ("GET", "/jobs/{id}"): Need("read", by_fleet=True),
-    ("POST", "/jobs/{id}/cancel"): Need("operate", by_fleet=True),
-    ("GET", "/reports/{id}"): Need("read", by_fleet=True),
-    ("GET", "/reports/{id}/page"): Need("read", by_fleet=True),
-    ("GET", "/reports/{id}/system"): Need("read", by_fleet=True),
-    ("GET", "/"): Need("read", by_fleet=True),
-    ("GET", "/fleet/knowledge"): Need("read", by_fleet=True),
-    ("GET", "/vehicles"): Need("read", by_fleet=True),
-    ("GET", "/vehicles/{id}"): Need("read", by_fleet=True),
-    ("GET", "/vehicles/{id}/{part}"): Need("read", by_fleet=True),
-    ("GET", "/vehicles/{id}/models/{version}"): Need("read", by_fleet=True),
-    ("GET", "/pages/vehicles/{id}"): Need("read", by_fleet=True),
-    ("GET", "/pages/vehicles/{id}/standing"): Need("read", by_fleet=True),
-    ("POST", "/vehicles/{id}/{deed}"): Need("operate", by_fleet=True),
-    ("PATCH", "/vehicles/{id}"): Need("operate", by_fleet=True),
-    ("DELETE", "/vehicles/{id}"): Need("admin", by_fleet=True),
-    ("GET", "/audit"): Need("admin"),
-    ("GET", "/tokens"): Need("admin"),
-    ("POST", "/tokens"): Need("admin"),
-    ("DELETE", "/tokens/{id}"): Need("admin"),
-    ("GET", "/debug/profile"): Need("admin"),
+NEEDS: dict[tuple[str, str], RequiredScope] = {
+    ("GET", "/health/live"): RequiredScope(PUBLIC, limited=False),
+    ("GET", "/health/ready"): RequiredScope(PUBLIC),
+    ("GET", "/signin"): RequiredScope(PUBLIC),
+    ("POST", "/signin"): RequiredScope(PUBLIC, body=("application/x-www-form-urlencoded",)),
+    ("GET", "/signin/oidc"): RequiredScope(PUBLIC),
+    ("GET", "/signin/oidc/callback"): RequiredScope(PUBLIC),
+    ("POST", "/signout"): RequiredScope(PUBLIC, body=("application/x-www-form-urlencoded",)),
+    ("GET", "/static/{path}"): RequiredScope(PUBLIC),
+    ("GET", "/favicon.ico"): RequiredScope(PUBLIC),
+    ("GET", "/docs"): RequiredScope("read", by_fleet=True),
+    ("GET", "/openapi.json"): RequiredScope("read", by_fleet=True),
+    ("POST", "/identify"): RequiredScope("ingest", by_fleet=True),
+    ("POST", "/ingest/estimates"): RequiredScope(
+        "ingest", by_fleet=True, body=(MEDIA_TYPE, "application/octet-stream")
+    ),
+    ("POST", "/ingest/windows"): RequiredScope("ingest", by_fleet=True),
+    ("POST", "/recordings"): RequiredScope("ingest", by_fleet=True, body=(FORM,)),
+    ("POST", "/diagnose"): RequiredScope("operate", by_fleet=True, body=("application/json", FORM)),
+    ("GET", "/jobs/{id}"): RequiredScope("read", by_fleet=True),
+    ("POST", "/jobs/{id}/cancel"): RequiredScope("operate", by_fleet=True),
+    ("GET", "/reports/{id}"): RequiredScope("read", by_fleet=True),
+    ("GET", "/reports/{id}/page"): RequiredScope("read", by_fleet=True),
+    ("GET", "/reports/{id}/system"): RequiredScope("read", by_fleet=True),
+    ("GET", "/"): RequiredScope("read", by_fleet=True),
+    ("GET", "/fleet/knowledge"): RequiredScope("read", by_fleet=True),
+    ("GET", "/vehicles"): RequiredScope("read", by_fleet=True),
+    ("GET", "/vehicles/{id}"): RequiredScope("read", by_fleet=True),
+    ("GET", "/vehicles/{id}/{part}"): RequiredScope("read", by_fleet=True),
+    ("GET", "/vehicles/{id}/models/{version}"): RequiredScope("read", by_fleet=True),
+    ("GET", "/pages/vehicles/{id}"): RequiredScope("read", by_fleet=True),
+    ("GET", "/pages/vehicles/{id}/standing"): RequiredScope("read", by_fleet=True),
+    ("POST", "/vehicles/{id}/{deed}"): RequiredScope("operate", by_fleet=True),
+    ("PATCH", "/vehicles/{id}"): RequiredScope("operate", by_fleet=True),
+    ("DELETE", "/vehicles/{id}"): RequiredScope("admin", by_fleet=True),
+    ("GET", "/audit"): RequiredScope("admin"),
+    ("GET", "/tokens"): RequiredScope("admin"),
+    ("POST", "/tokens"): RequiredScope("admin"),
+    ("DELETE", "/tokens/{id}"): RequiredScope("admin"),
+    ("GET", "/debug/profile"): RequiredScope("admin"),
 }
 OTHER = "other"
-READ, ADMIN = Need("read"), Need("admin")
+READ, ADMIN = RequiredScope("read"), RequiredScope("admin")
 VEHICLE_PATH = re.compile(r"^/(?:pages/)?vehicles/([^/]+)")
 
 
@@ -82,7 +84,7 @@ def _pattern(template: str) -> re.Pattern[str]:
 _PATTERNS = [(method, _pattern(template), need, template) for (method, template), need in NEEDS.items()]
 
 
-def need_of(method: str, path: str) -> Need:
+def need_of(method: str, path: str) -> RequiredScope:
     """What a request needs; reading needs `read`, and anything else that is not listed `admin`."""
     method = "GET" if method in ("HEAD", "OPTIONS") else method
     for listed, pattern, need, _ in _PATTERNS:

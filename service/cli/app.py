@@ -198,9 +198,9 @@ def diagnose(
     """What the model leaves out: where, which law, how much better the simulation fits with it."""
     one_thread_each()  # candidates are fitted beside each other
     hand_over_often()
-    from sprung.service.cli.diagnose import Asked, run
+    from sprung.service.cli.diagnose import DiagnoseOptions, run
 
-    return run(file, system, dbc, Asked(out, name, start, write_system, laws, write_laws), json_lines)
+    return run(file, system, dbc, DiagnoseOptions(out, name, start, write_system, laws, write_laws), json_lines)
 
 
 @app.command()

@@ -27,7 +27,7 @@ from sprung.service.sources.loading import RecordRequest
 
 
 @dataclass(frozen=True)
-class Asked:
+class DiagnoseOptions:
     """Options of one diagnosis."""
 
     out: Path | None = None  # folder of the page
@@ -38,7 +38,7 @@ class Asked:
     write_laws: Path | None = None  # formulas as such
 
 
-def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, json_lines: bool) -> int:
+def run(file: Path, system_file: Path | None, dbc: Path | None, asked: DiagnoseOptions, json_lines: bool) -> int:
     """Diagnose one recording; 1 for any verdict but `consistent`, or when it could not be decided."""
     _check_targets(asked)
     catalogue = CATALOGUE
@@ -81,7 +81,7 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
     return 0 if report.verdict == "consistent" and not report.recording.lost else 1
 
 
-def _check_targets(asked: Asked) -> None:
+def _check_targets(asked: DiagnoseOptions) -> None:
     """Files that cannot be written are reported before the work begins."""
     check_file(asked.write_system)
     check_file(asked.write_laws)

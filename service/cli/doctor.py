@@ -21,7 +21,7 @@ from sprung.model.system import load_system
 from sprung.replay.bus import opening_options, parse_bus
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
-from sprung.service.store.status import Wanted, health_counts
+from sprung.service.store.status import StatusFilter, health_counts
 
 BUS_SECONDS = 3.0
 LOW_BYTES = 1_000_000_000
@@ -101,7 +101,7 @@ def _store(settings: Settings) -> Iterator[Check]:
     store = open_store(settings.store_url)
     try:
         with store.read() as connection:
-            vehicles = sum(health_counts(connection, Wanted()).values())
+            vehicles = sum(health_counts(connection, StatusFilter()).values())
             if connection.dialect.name == "sqlite":
                 said = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
                 if said != "ok":

@@ -34,7 +34,7 @@ from sprung.service.monitoring.views import (
 )
 from sprung.service.processes.worker import ProcessLimits
 from sprung.service.settings import settings_with
-from sprung.service.sources.feed import Fed, comfort_dict, feed_file
+from sprung.service.sources.feed import FeedResult, comfort_dict, feed_file
 from sprung.service.store import Store, open_store, work
 from sprung.service.times import to_iso
 
@@ -111,7 +111,7 @@ def _replay(
     start: int | None,
     json_lines: bool,
     keeps: bool,
-) -> Fed:
+) -> FeedResult:
     system = pipeline.engine.system
     row = file_row(path)
     with store.write() as connection:
@@ -158,7 +158,7 @@ def told_when_interrupted(kept: Counter[str], url: object | None) -> Iterator[No
         raise
 
 
-def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
+def _report(pipeline: Pipeline, path: Path, fed: FeedResult, json_lines: bool) -> int:
     """Print the outcome; the exit status of this file."""
     assert fed.state is not None
     view = vehicle_view(pipeline.engine, fed.vehicle, fed.state, None)
@@ -176,7 +176,7 @@ def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
     return int(bool(complaint) or bool(view.active) or not fed.monitored)
 
 
-def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
+def summary(pipeline: Pipeline, view: VehicleView, fed: FeedResult) -> dict[str, Any]:
     """The last line of `replay --json`."""
     return {
         "vehicle": fed.vehicle,
@@ -195,12 +195,12 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
     }
 
 
-def health(view: VehicleView, fed: Fed) -> str:
+def health(view: VehicleView, fed: FeedResult) -> str:
     """The vehicle's health; an uninformative recording asks for a functional check."""
     return view.health if fed.monitored or view.health == "failure" else "check_function"
 
 
-def slower_line(fed: Fed, speed: float) -> str | None:
+def slower_line(fed: FeedResult, speed: float) -> str | None:
     """What to say of a replay that did not keep up with the speed that was asked for; None where it did."""
     recorded = fed.recorded_seconds
     pace = recorded / max(fed.wall_seconds, 1e-9)
@@ -209,7 +209,7 @@ def slower_line(fed: Fed, speed: float) -> str | None:
     return f"--speed {speed:g} was asked for and {pace:.2g} reached: this machine, busy as it is, is no faster"
 
 
-def closing_line(view: VehicleView, fed: Fed) -> str:
+def closing_line(view: VehicleView, fed: FeedResult) -> str:
     """Closing line: data read, speed, and alarms."""
     recorded = fed.recorded_seconds
     counts = ", ".join(f"{count} {outcome}" for outcome, count in fed.windows.items())
@@ -246,7 +246,7 @@ def measurement_lines(found: dict[str, Any]) -> list[str]:
     ]
 
 
-def incomplete_line(path: Path, fed: Fed) -> str | None:
+def incomplete_line(path: Path, fed: FeedResult) -> str | None:
     """One line that says how much of a recording was lost; None when nothing was."""
     parts = []
     if fed.lost:

@@ -19,7 +19,7 @@ from sprung.service.main import Feeds, serve
 from sprung.service.monitoring.views import vehicle_view
 from sprung.service.observability.logs import set_up
 from sprung.service.settings import settings_with
-from sprung.service.sources.feed import Fed, OnBatch
+from sprung.service.sources.feed import FeedResult, OnBatch
 
 
 def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[str], vehicle: str | None) -> int:
@@ -42,11 +42,11 @@ def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[st
     return 0
 
 
-def watch(path: Path, core: Core) -> tuple[OnBatch, Callable[[Fed], None]]:
+def watch(path: Path, core: Core) -> tuple[OnBatch, Callable[[FeedResult], None]]:
     """Show a recording that is replayed into the service, then its table."""
     system = core.engine.system
 
-    def on_end(fed: Fed) -> None:
+    def on_end(fed: FeedResult) -> None:
         assert fed.state is not None
         view = vehicle_view(core.engine, fed.vehicle, fed.state, None)
         print_table(parameter_table(replace(view, health=health(view, fed)), width_of_output()))

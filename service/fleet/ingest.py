@@ -20,7 +20,7 @@ from sprung.service.errors import UserError
 from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
-from sprung.service.monitoring.processed import Folded, HeldVehicle, ToFold
+from sprung.service.monitoring.processed import FoldedWindows, HeldVehicle, WindowsToFold
 from sprung.service.store import pending
 from sprung.service.store.partitions import prepare
 from sprung.service.store.pending import Waiting
@@ -38,7 +38,7 @@ class OtherModel(UserError):
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
+class IngestResult:
     """What became of one message."""
 
     vehicle: str
@@ -60,7 +60,7 @@ class Ingest:
         self._stopping = threading.Event()
         self._sweeper = threading.Thread(target=self._sweep_on, name="sprung-sweep", daemon=True)
 
-    def take(self, messages: Sequence[Message]) -> list[Taken]:
+    def take(self, messages: Sequence[Message]) -> list[IngestResult]:
         """Fold messages of any vehicles in one transaction; they are stored when this returns.
 
         Raises UserError for a message that cannot be folded, before anything is stored.
@@ -69,8 +69,8 @@ class Ingest:
         for message in messages:
             _check_times(message, now)
         prepare(self._pipeline.store, (w.start for message in messages for w in message.windows))
-        taken: dict[int, Taken] = {}
-        folded: list[Folded] = []
+        taken: dict[int, IngestResult] = {}
+        folded: list[FoldedWindows] = []
         with self._pipeline.store.write() as connection:
             held = self._pipeline.hold_all(connection, {message.vehicle for message in messages})
             for message in messages:
@@ -118,13 +118,13 @@ class Ingest:
             self._settle([] if folded is None else [folded])
         return count
 
-    def _settle(self, folded: Sequence[Folded]) -> None:
+    def _settle(self, folded: Sequence[FoldedWindows]) -> None:
         for one in folded:
             self._pipeline.settle(one)
 
     def _fold_due(
         self, connection: Connection, messages: Sequence[Message], held: Mapping[str, HeldVehicle], now: int
-    ) -> list[tuple[Taken, Folded | None]]:
+    ) -> list[tuple[IngestResult, FoldedWindows | None]]:
         """Fold the due windows of some vehicles, waiting and new ones, each once; keep the rest."""
         models = {message.vehicle: held[message.vehicle].served.model_id for message in messages}
         waited = pending.waiting(connection, models)
@@ -171,7 +171,7 @@ class Ingest:
             for start in sorted(set(came) - set(due))
         ]
         waits = sum(w.start not in done for w in fresh)
-        taken = Taken(vehicle, len(order), waits, len(message.windows) - len(fresh))
+        taken = IngestResult(vehicle, len(order), waits, len(message.windows) - len(fresh))
         return DueWindows(message, at, order, [row.start for row in waited if row.start in done], rest, taken)
 
 
@@ -184,13 +184,13 @@ class DueWindows:
     order: list[WindowEstimate]  # to be folded now
     released: list[int]  # starts of those that wait no longer
     rest: list[Waiting]  # that wait from now on
-    taken: Taken
+    taken: IngestResult
 
-    def to_fold(self) -> ToFold:
+    def to_fold(self) -> WindowsToFold:
         """As the pipeline takes it."""
         system = self.at.served.engine.system
         windows = [one.window(system.sample_rate, len(system.channels)) for one in self.order]
-        return ToFold(self.message.vehicle, windows, [one.estimate for one in self.order], self.at)
+        return WindowsToFold(self.message.vehicle, windows, [one.estimate for one in self.order], self.at)
 
 
 def _turns(messages: Sequence[Message]) -> list[list[int]]:

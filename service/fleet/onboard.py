@@ -20,7 +20,7 @@ from sprung.service.fleet.message import Message, WindowEstimate, encode
 from sprung.service.fleet.spool import Spool
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.engine import Engine
-from sprung.service.monitoring.following import Followed
+from sprung.service.monitoring.following import FollowedVehicle
 from sprung.service.monitoring.ring import Rings
 from sprung.service.times import NANOSECONDS, now_ns, to_iso
 
@@ -71,7 +71,7 @@ class Onboard:
         self._raw_due: int | None = None  # ns: when enough samples after an alarm will be there
         self._raw_next = 0  # ns: before it, none are sent again
         state = self._restored()
-        self._followed = Followed(state, -1 if state.time is None else state.time)
+        self._followed = FollowedVehicle(state, -1 if state.time is None else state.time)
 
     def process(
         self,

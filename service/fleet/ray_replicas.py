@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from sprung.model.signals import Estimate, FloatArray
 from sprung.service.errors import UserError
-from sprung.service.fleet.ingest import Ingest, Taken
+from sprung.service.fleet.ingest import Ingest, IngestResult
 from sprung.service.fleet.message import Message
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import load_engine
@@ -39,11 +39,11 @@ class FoldReplica:
         self._ingest = Ingest(pipeline, settings.late_seconds)
         self._ingest.start()
 
-    async def fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
+    async def fold(self, messages: Sequence[Message]) -> list[IngestResult | UserError]:
         """What became of each message; they are stored, but for those with an error."""
         return await asyncio.to_thread(self._fold, messages)
 
-    def _fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
+    def _fold(self, messages: Sequence[Message]) -> list[IngestResult | UserError]:
         try:
             return list(self._ingest.take(messages))
         except UserError as error:  # one of them spoils it for the others

@@ -19,7 +19,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import Busy, NotFound, UserError
-from sprung.service.observability.queues import Waits
+from sprung.service.observability.queues import WaitMetrics
 from sprung.service.store import Store, work
 from sprung.service.times import NANOSECONDS, now_ns
 
@@ -30,7 +30,7 @@ PROGRESS_SECONDS = 1.0  # between two notes of progress in the store
 RETRY_SECONDS = 5.0  # while the store refuses to take what became of a job
 
 
-class Stopped(Exception):
+class ServiceStopped(Exception):
     """Raised inside a handler when the service stops."""
 
 
@@ -59,7 +59,7 @@ class Progress:
     def check(self) -> None:
         """Raises Stopped when the service stops, Cancelled, or UserError when the job's time is over."""
         if self._stopping.is_set():
-            raise Stopped
+            raise ServiceStopped
         if self._cancelled.is_set():
             raise Cancelled
         if time.monotonic() > self._deadline:
@@ -89,7 +89,9 @@ class Kind:
 class Jobs:
     """Accepts jobs and works through those of a kind in order; a recording does not wait for a diagnosis of minutes."""
 
-    def __init__(self, store: Store, kinds: Mapping[str, Kind], queue_size: int, waits: Waits | None = None) -> None:
+    def __init__(
+        self, store: Store, kinds: Mapping[str, Kind], queue_size: int, waits: WaitMetrics | None = None
+    ) -> None:
         self._waits = waits
         self._store = store
         self._kinds = kinds
@@ -227,7 +229,7 @@ class Jobs:
             if kind is None:
                 raise UserError(f"jobs of kind {job.kind!r} are not known to this version")
             return {"state": "done", "progress": 1.0, "result": kind.run(job, progress), "attempts": job.attempts}
-        except Stopped:
+        except ServiceStopped:
             return {"state": "queued", "attempts": job.attempts}  # an end in good order is no attempt
         except Cancelled:
             return {"state": "failed", "attempts": job.attempts}

@@ -13,7 +13,7 @@ from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import Batch
 from sprung.service.processes.worker import ProcessLimits
 from sprung.service.settings import Settings
-from sprung.service.sources.feed import Fed, OnTally, feed_file
+from sprung.service.sources.feed import FeedResult, OnTally, feed_file
 from sprung.service.sources.reading import SLOWEST_BYTES_PER_SECOND
 from sprung.service.store import Store, fleet, work
 from sprung.service.store.work import JobRow
@@ -82,7 +82,7 @@ def file_row(path: Path) -> work.RecordingRow:
     )
 
 
-def finish_row(store: Store, row: work.RecordingRow, fed: Fed) -> None:
+def finish_row(store: Store, row: work.RecordingRow, fed: FeedResult) -> None:
     """Write down what reading the file came to."""
     with store.write() as connection:
         fleet.ensure_vehicle(connection, fed.vehicle, now_ns())

@@ -27,7 +27,7 @@ from sprung.service.monitoring.compute import Compute, Priority
 from sprung.service.monitoring.engines import ServedModel
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.together import FoundWindow, track_together
-from sprung.service.monitoring.turns import Turns
+from sprung.service.monitoring.turns import FairQueues
 from sprung.service.store.vehicle_models import SERVICE_FILE
 from sprung.service.store.windows import WindowRecord
 
@@ -109,7 +109,7 @@ class Batcher:
         self._observe = observe
         self._beside = beside
         self._reading = 0
-        self._waiting = Turns(_whose)
+        self._waiting = FairQueues(_whose)
         self._to_track: deque[_Request] = deque()
         self._lock = threading.Lock()
         self._called = False  # a batch is in the compute's queue, or being identified

@@ -12,7 +12,7 @@ from sqlalchemy import Connection
 from sprung.service.monitoring.processed import HeldVehicle
 from sprung.service.monitoring.views import VehicleView, vehicle_view
 from sprung.service.store import fleet, history, status
-from sprung.service.store.circumstances import Ran, add_circumstances
+from sprung.service.store.circumstances import WindowCircumstances, add_circumstances
 from sprung.service.store.standing import UNINFORMATIVE
 from sprung.service.store.status import NewStatus
 from sprung.service.store.windows import VehicleWindows, WindowRecord, add_windows
@@ -27,7 +27,7 @@ class TrackerChange:
     vehicle: str
     after: HeldVehicle
     records: Sequence[WindowRecord] = ()  # that are not stored yet
-    ran: Sequence[Ran] = ()  # how the vehicle ran in them
+    ran: Sequence[WindowCircumstances] = ()  # how the vehicle ran in them
 
     @cached_property
     def row(self) -> fleet.TrackerRow:

@@ -13,19 +13,19 @@ import numpy as np
 from sprung.model.signals import Conditions, Estimate, Window
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from sprung.service.monitoring.engine import Engine
-from sprung.service.monitoring.processed import HeldVehicle, ToFold, outcome_of
+from sprung.service.monitoring.processed import HeldVehicle, WindowsToFold, outcome_of
 from sprung.service.monitoring.views import in_kg, running
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
-from sprung.service.store.circumstances import Ran
+from sprung.service.store.circumstances import WindowCircumstances
 from sprung.service.store.standing import counted
-from sprung.service.store.windows import Posterior, Solved, WindowLoads, WindowRecord
+from sprung.service.store.windows import Posterior, StoredEstimate, WindowLoads, WindowRecord
 from sprung.service.times import AHEAD
 
 _NO_SAMPLES = np.zeros((0, 0))
 
 
 @dataclass(frozen=True, slots=True)
-class Followed:
+class FollowedVehicle:
     """How far a vehicle has been followed."""
 
     state: TrackerState
@@ -38,7 +38,7 @@ class Followed:
         estimate: Estimate | None,
         now: int,
         conditions: Conditions | None = None,
-    ) -> Followed:
+    ) -> FollowedVehicle:
         """After one more window; itself where the window is older than what the tracker has seen.
 
         An older one is followed all the same when the clock must have been wrong: where the clock of its stream
@@ -47,41 +47,41 @@ class Followed:
         """
         at = self
         if window.start <= at.last and (window.new_segment or at.last > now + AHEAD):
-            at = Followed(tracker.rebase(at.state, window.start), window.start - 1)
+            at = FollowedVehicle(tracker.rebase(at.state, window.start), window.start - 1)
         if window.start <= at.last:
             return at
         if estimate is None:
             return replace(at, state=tracker.missed(at.state))
-        return Followed(tracker.update(at.state, estimate, window.start, conditions), window.start)
+        return FollowedVehicle(tracker.update(at.state, estimate, window.start, conditions), window.start)
 
 
 @dataclass(frozen=True, slots=True)
 class FollowedWindows:
     """What has become of windows."""
 
-    followed: Followed
+    followed: FollowedVehicle
     records: list[WindowRecord]
-    ran: list[Ran]
+    ran: list[WindowCircumstances]
 
 
-Following = Callable[[Sequence[ToFold], int], Generator[FollowedWindows, None, None]]
+Following = Callable[[Sequence[WindowsToFold], int], Generator[FollowedWindows, None, None]]
 
 
-def follow(asked: Iterable[ToFold], now: int) -> Generator[FollowedWindows, None, None]:
+def follow(asked: Iterable[WindowsToFold], now: int) -> Generator[FollowedWindows, None, None]:
     """Feed each vehicle's windows to its tracker, one vehicle after the other.  now: ns, the clock of this host."""
     for one in asked:
         served = one.at.served
         yield _pass(served.engine, served.model_id, _reached(one.at), one.windows, one.estimates, now)
 
 
-def _reached(at: HeldVehicle) -> Followed:
-    return Followed(at.state, at.last_window_ns)
+def _reached(at: HeldVehicle) -> FollowedVehicle:
+    return FollowedVehicle(at.state, at.last_window_ns)
 
 
 def _pass(
     engine: Engine,
     model_id: int,
-    followed: Followed,
+    followed: FollowedVehicle,
     windows: Sequence[Window],
     estimates: Sequence[Estimate | None],
     now: int,
@@ -102,8 +102,8 @@ def _pass(
         loads = in_kg(engine, tracker.loads(followed.state)) if known else {}
         alone = {} if estimate is None else in_kg(engine, tracker.loads_of_window(estimate))
         stood = counted(outcome, model_id) if posterior is not None else {}
-        ran.append(Ran(window.start, running(system, window, loads) | stood))
-        solved = None if estimate is None else Solved.of(estimate)
+        ran.append(WindowCircumstances(window.start, running(system, window, loads) | stood))
+        solved = None if estimate is None else StoredEstimate.of(estimate)
         record = WindowRecord(window.start, outcome, reason, window.repaired_samples, fed, solved, posterior)
         kept = WindowLoads(
             *(
@@ -129,13 +129,13 @@ class FollowingApart:
         self._lock = threading.Lock()
         self.forked = ForkedFunctions("tracks vehicles", {"follow": _Follower(engine).follow})
 
-    def __call__(self, asked: Sequence[ToFold], now: int) -> Generator[FollowedWindows, None, None]:
+    def __call__(self, asked: Sequence[WindowsToFold], now: int) -> Generator[FollowedWindows, None, None]:
         """As `follow`; the process works on the next vehicle while the caller does something with one."""
         with self._lock, closing(self._apart([one for one in asked if self._is_mine(one)], now)) as apart:
             for one in asked:
                 yield next(apart if self._is_mine(one) else follow([one], now))
 
-    def _apart(self, asked: Sequence[ToFold], now: int) -> Generator[FollowedWindows, None, None]:
+    def _apart(self, asked: Sequence[WindowsToFold], now: int) -> Generator[FollowedWindows, None, None]:
         """Of vehicles that the process follows."""
         if not asked:
             return
@@ -155,10 +155,10 @@ class FollowingApart:
                 self._there.pop(key, None)
             raise
 
-    def _is_mine(self, one: ToFold) -> bool:
+    def _is_mine(self, one: WindowsToFold) -> bool:
         return one.at.served.engine.tracker is self._tracker
 
-    def _sent(self, key: _Key, one: ToFold) -> _Sent:
+    def _sent(self, key: _Key, one: WindowsToFold) -> _Sent:
         known = self._there.get(key) is one.at.state
         windows = [replace(window, values=_NO_SAMPLES) for window in one.windows]
         return key, None if known else one.at.state, one.at.last_window_ns, windows, one.estimates
@@ -183,7 +183,7 @@ class _Follower:
         for key in gone:
             self._states.pop(key, None)
         for key, state, last, windows, estimates in sent:
-            at = Followed(self._states[key] if state is None else state, last)
+            at = FollowedVehicle(self._states[key] if state is None else state, last)
             passed = _pass(self._engine, key[1], at, windows, estimates, now)
             self._states[key] = passed.followed.state
             yield passed

@@ -17,7 +17,7 @@ MOST_WAITING = 1000  # vehicles with news that a slow listener has not fetched; 
 
 
 @dataclass(frozen=True, slots=True)
-class News:
+class VehicleNews:
     """A vehicle has new windows, or something about it was changed."""
 
     vehicle: str
@@ -33,10 +33,10 @@ class Listener:
         self.ended = False  # given up for another one
         self._vehicle = vehicle
         self._wake = wake
-        self._news: OrderedDict[str, News] = OrderedDict()
+        self._news: OrderedDict[str, VehicleNews] = OrderedDict()
         self._lock = threading.Lock()
 
-    def put(self, news: News) -> None:
+    def put(self, news: VehicleNews) -> None:
         """Take news, unless they are about another vehicle."""
         if self._vehicle not in (None, news.vehicle):
             return
@@ -51,7 +51,7 @@ class Listener:
         self.ended = True
         self._wake()
 
-    def take(self) -> list[News]:
+    def take(self) -> list[VehicleNews]:
         """Everything new, oldest first."""
         with self._lock:
             found = list(self._news.values())
@@ -68,7 +68,7 @@ class Hub:
 
     def on_batch(self, batch: Batch) -> None:
         """Tell that a vehicle has changed."""
-        news = News(batch.vehicle, batch.state.time, len(batch.state.active))
+        news = VehicleNews(batch.vehicle, batch.state.time, len(batch.state.active))
         with self._lock:
             listeners = list(self._listeners)
         for listener in listeners:

@@ -19,7 +19,15 @@ from sprung.service.monitoring.compute import Compute, Priority
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.engines import Engines, ServedModel
 from sprung.service.monitoring.following import FollowedWindows, Following, follow
-from sprung.service.monitoring.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, ToFold
+from sprung.service.monitoring.processed import (
+    Batch,
+    FoldedWindows,
+    HeldVehicle,
+    IdentifiedBatch,
+    ModelChanged,
+    Newcomer,
+    WindowsToFold,
+)
 from sprung.service.monitoring.turns import Pace
 from sprung.service.monitoring.views import VehicleView, vehicle_view
 from sprung.service.store import Store, fleet, status
@@ -94,16 +102,16 @@ class Pipeline:
         """
         return self.keep(self.identify(vehicle, windows, priority), recording_id)
 
-    def identify(self, vehicle: str, windows: Sequence[Window], priority: Priority = Priority.BATCH) -> Identified:
+    def identify(self, vehicle: str, windows: Sequence[Window], priority: Priority = Priority.BATCH) -> IdentifiedBatch:
         """The first half of `process`: may run while the batch before is still tracked and stored."""
         with self.store.read() as connection:
             served = self.engines.of(connection, vehicle)
             known = known_windows(connection, vehicle, served.model_id, [w.start for w in windows])
         fresh = [w for w in windows if w.start not in known]
         estimates, seconds = self._identify(vehicle, served, fresh, priority)
-        return Identified(vehicle, served, windows, known, fresh, estimates, seconds)
+        return IdentifiedBatch(vehicle, served, windows, known, fresh, estimates, seconds)
 
-    def keep(self, found: Identified, recording_id: str | None = None) -> Batch:
+    def keep(self, found: IdentifiedBatch, recording_id: str | None = None) -> Batch:
         """The second half of `process`: track and store, in order of time."""
         while True:
             try:
@@ -190,7 +198,7 @@ class Pipeline:
         estimates: Sequence[Estimate | None],
         recording_id: str | None = None,
         served: ServedModel | None = None,
-    ) -> Folded:
+    ) -> FoldedWindows:
         """Track and store windows inside a transaction of the caller's; hand what comes back to `settle` after it.
 
         served: with which they were identified; left out: the caller has looked in this transaction.  Raises
@@ -205,7 +213,7 @@ class Pipeline:
         # another process may have stored some of them while this one was identifying
         raced = known_windows(connection, vehicle, at.served.model_id, [w.start for w in windows])
         left = [(w, e) for w, e in zip(windows, estimates, strict=True) if w.start not in raced]
-        asked = ToFold(vehicle, [w for w, _ in left], [e for _, e in left], at)
+        asked = WindowsToFold(vehicle, [w for w, _ in left], [e for _, e in left], at)
         folded = self.fold_all(connection, [asked], recording_id)[0]
         if raced:
             stored = {record.start: record for record in folded.batch.records} | raced
@@ -213,13 +221,13 @@ class Pipeline:
         return folded
 
     def fold_all(
-        self, connection: Connection, asked: Sequence[ToFold], recording_id: str | None = None
-    ) -> list[Folded]:
+        self, connection: Connection, asked: Sequence[WindowsToFold], recording_id: str | None = None
+    ) -> list[FoldedWindows]:
         """As `fold`, of several vehicles that are held (`hold_all`), each once, with the statements of one."""
         if not asked:
             return []
         now, started = self._clock(), time.perf_counter()
-        followed: list[tuple[ToFold, FollowedWindows, HeldVehicle, TrackerChange | None]] = []
+        followed: list[tuple[WindowsToFold, FollowedWindows, HeldVehicle, TrackerChange | None]] = []
         with closing(self._follow(asked, now)) as each:
             for one, passed in zip(asked, each, strict=True):
                 after = replace(one.at, state=passed.followed.state, last_window_ns=passed.followed.last)
@@ -240,17 +248,17 @@ class Pipeline:
 
     def _folded(
         self,
-        one: ToFold,
+        one: WindowsToFold,
         records: list[WindowRecord],
         after: HeldVehicle,
         seconds: dict[str, float],
         view: VehicleView | None,
-    ) -> Folded:
+    ) -> FoldedWindows:
         late = sum(record.solved is not None and not record.tracked for record in records)
         batch = Batch(one.vehicle, records, list(one.windows), late, after.state, one.at.served, seconds, view)
-        return Folded(batch, after)
+        return FoldedWindows(batch, after)
 
-    def settle(self, folded: Folded) -> None:
+    def settle(self, folded: FoldedWindows) -> None:
         """The transaction of `fold` is committed: remember the tracker and tell every listener."""
         self._remember(folded.batch.vehicle, folded.after)
         self.tell(folded.batch)

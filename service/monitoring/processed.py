@@ -27,7 +27,7 @@ class Batch:
 
 
 @dataclass(frozen=True, slots=True)
-class Identified:
+class IdentifiedBatch:
     """Windows on their way: identified, not yet tracked and stored."""
 
     vehicle: str
@@ -72,7 +72,7 @@ class HeldVehicle:
 
 
 @dataclass(frozen=True, slots=True)
-class ToFold:
+class WindowsToFold:
     """Windows of a vehicle that are to be tracked and stored, none of which is stored."""
 
     vehicle: str
@@ -91,7 +91,7 @@ class Newcomer:
 
 
 @dataclass(frozen=True, slots=True)
-class Folded:
+class FoldedWindows:
     """Windows that are tracked and stored in a transaction which may not be committed yet."""
 
     batch: Batch

@@ -11,7 +11,7 @@ from sprung.model.signals import Estimate, Window
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.engines import ServedModel
 from sprung.service.monitoring.pipeline import Pipeline
-from sprung.service.monitoring.processed import HeldVehicle, ToFold
+from sprung.service.monitoring.processed import HeldVehicle, WindowsToFold
 from sprung.service.store.partitions import prepare
 from sprung.service.store.windows import WindowRecord, known_windows, newest_start
 
@@ -39,7 +39,7 @@ def track_together(pipeline: Pipeline, found: Sequence[FoundWindow]) -> list[Win
     records: dict[tuple[str, int], WindowRecord] = {}
     with pipeline.store.write() as connection:
         held = pipeline.hold_all(connection, by_vehicle)
-        asked: list[ToFold] = []
+        asked: list[WindowsToFold] = []
         for vehicle, theirs in by_vehicle.items():
             at = held[vehicle]
             sent = {one.window.start: one for one in theirs if one.served.model_id == at.served.model_id}
@@ -47,7 +47,7 @@ def track_together(pipeline: Pipeline, found: Sequence[FoundWindow]) -> list[Win
             records |= {(vehicle, start): record for start, record in stored.items()}
             fresh = [sent[start] for start in sorted(sent) if start not in stored]
             if fresh:
-                asked.append(ToFold(vehicle, [one.window for one in fresh], [one.estimate for one in fresh], at))
+                asked.append(WindowsToFold(vehicle, [one.window for one in fresh], [one.estimate for one in fresh], at))
         folded = pipeline.fold_all(connection, asked)
     for done in folded:
         records |= {(done.batch.vehicle, record.start): record for record in done.batch.records}

@@ -37,7 +37,7 @@ class Pace:
             self._seconds[served.model_id] = seconds / windows
 
 
-class Turns(Generic[T]):
+class FairQueues(Generic[T]):
     """What waits, in queues by key; each queue has its turn, and goes behind the others then.  Not thread-safe."""
 
     def __init__(self, key: Callable[[T], Hashable]) -> None:

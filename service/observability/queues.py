@@ -9,7 +9,7 @@ from prometheus_client import CollectorRegistry, Histogram
 BUCKETS = (0.001, 0.005, 0.025, 0.1, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0)
 
 
-class Waits:
+class WaitMetrics:
     """How long work waits before it is begun, and how long jobs take."""
 
     def __init__(self, registry: CollectorRegistry) -> None:

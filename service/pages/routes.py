@@ -19,7 +19,7 @@ from sprung.service.fleet.statistics import knowledge_dict
 from sprung.service.rendering.drawing import columns, small_view
 from sprung.service.rendering.render import render
 from sprung.service.store import status
-from sprung.service.store.status import Sort, Wanted
+from sprung.service.store.status import Sort, StatusFilter
 
 router = APIRouter(include_in_schema=False)
 
@@ -54,7 +54,7 @@ async def fleet_page(
 ) -> HTMLResponse:
     """The fleet, those that need attention first."""
     before = silent_before(core)
-    wanted = Wanted(
+    wanted = StatusFilter(
         q.strip(),
         one_of("health", health or None, tuple(HEALTH)),
         before if silent else None,
@@ -79,7 +79,7 @@ async def fleet_page(
             knowledge=None if knowledge is None else knowledge_dict(knowledge, SHOWN_STANDINGS),
             counts=counts,
             wanted=wanted,
-            searching=wanted != Wanted(fleet=actor.fleet),
+            searching=wanted != StatusFilter(fleet=actor.fleet),
             health=HEALTH,
             system=core.engine.system.name,
             sort=sort,

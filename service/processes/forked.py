@@ -54,7 +54,7 @@ _NO_MORE = object()
 
 
 @dataclass(frozen=True, slots=True)
-class _There:
+class _OtherProcess:
     """The process, seen from here."""
 
     process: BaseProcess
@@ -87,7 +87,7 @@ class ForkedFunctions:
         process.start()
         asked.close()
         answer.close()
-        self._there: _There | None = _There(process, ask, answers)
+        self._there: _OtherProcess | None = _OtherProcess(process, ask, answers)
         atexit.register(self.close)  # before multiprocessing's own, which would wait for it
 
     @property
@@ -132,7 +132,7 @@ class ForkedFunctions:
         answer: tuple[Any, _Kind] = self._transfer(lambda there: there.answers.recv())
         return answer
 
-    def _transfer(self, through: Callable[[_There], Any]) -> Any:
+    def _transfer(self, through: Callable[[_OtherProcess], Any]) -> Any:
         """Send or receive."""
         there = self._there
         if there is None:

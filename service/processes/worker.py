@@ -59,7 +59,7 @@ class _Begun:
 
 
 @dataclass(frozen=True, slots=True)
-class _Said:
+class _SentMessage:
     message: Any
 
 
@@ -124,7 +124,7 @@ class Worker(Generic[Message, Result]):
                 match self._next(check):
                     case _Begun():
                         self._begun = time.monotonic()
-                    case _Said(message):
+                    case _SentMessage(message):
                         yield message
                     case _Done(result):
                         self._result = result
@@ -208,7 +208,7 @@ def _run(
 
     say(_Begun())
     try:
-        say(_Done(task(request, lambda message: say(_Said(message)))))
+        say(_Done(task(request, lambda message: say(_SentMessage(message)))))
     except MemoryError:
         say(_Refused(f"it needs more memory than the {(limits.memory_bytes or 0) / 1e9:.1f} GB that are allowed"))
     except (ValueError, OSError) as error:  # what every folder raises for input that cannot be used

@@ -16,7 +16,7 @@ from sprung.model.tracking.tracker import TrackerState
 from sprung.service.monitoring import rides
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.pipeline import Pipeline
-from sprung.service.monitoring.processed import Batch, Identified
+from sprung.service.monitoring.processed import Batch, IdentifiedBatch
 from sprung.service.processes.worker import ProcessLimits
 from sprung.service.sources.reading import Ending, Reading, ReadRequest, prefetched, reading_of
 from sprung.service.times import AHEAD, now_ns, to_iso
@@ -30,7 +30,7 @@ OnTally = Callable[[Tally], None]
 
 
 @dataclass(slots=True)
-class Fed:
+class FeedResult:
     """What feeding a source came to."""
 
     vehicle: str
@@ -100,7 +100,7 @@ def feed_file(
     on_tally: OnTally = lambda tally: None,
     check: Callable[[], None] = lambda: None,
     start: int | None = None,
-) -> Fed:
+) -> FeedResult:
     """Read a recording to its end, through the pipeline.
 
     file_name: what the user calls the file, where `path` is a name of the service's own.
@@ -114,7 +114,7 @@ def feed_file(
     )
     reading = reading_of(request, limits)
     started = time.perf_counter()
-    fed = Fed("", ride=comfort.RideQuality(pipeline.engine.system))
+    fed = FeedResult("", ride=comfort.RideQuality(pipeline.engine.system))
 
     def name(recorded: str | None) -> str:
         return fed.vehicle or vehicle_of(vehicle, recorded, file_name or path.name)
@@ -139,12 +139,12 @@ def feed_file(
 
 def _identified(
     pipeline: Pipeline,
-    fed: Fed,
+    fed: FeedResult,
     reading: Reading,
     name: Callable[[str | None], str],
     priority: Priority,
     check: Callable[[], None],
-) -> Iterator[tuple[Identified | None, Tally]]:
+) -> Iterator[tuple[IdentifiedBatch | None, Tally]]:
     """Windows as they are read, identified, with the tally until there; the ride's comfort is kept beside them."""
     for piece in reading.pieces(check):
         found = None
@@ -157,7 +157,7 @@ def _identified(
         yield found, piece.tally
 
 
-def _ended(fed: Fed, ending: Ending) -> None:
+def _ended(fed: FeedResult, ending: Ending) -> None:
     """Take over what is known of a recording once it has been read."""
     fed.tally, fed.problems, fed.incomplete = ending.tally, ending.problems, ending.incomplete
     fed.expected, fed.lost = ending.expected, ending.lost
@@ -173,7 +173,7 @@ def ride_dict(ride: comfort.RideQuality) -> dict[str, Any]:
     return ride.summary() | {"by_minute": [{"start": to_iso(start), "sensors": figures} for start, figures in minutes]}
 
 
-def comfort_dict(pipeline: Pipeline, fed: Fed) -> dict[str, Any]:
+def comfort_dict(pipeline: Pipeline, fed: FeedResult) -> dict[str, Any]:
     """The ride's comfort, and what the changes from the vehicle's own baseline cost of it on an average track."""
     figures = ride_dict(fed.ride) if fed.ride is not None else {"minutes": 0, "sensors": {}}
     if fed.state is None:
@@ -181,7 +181,7 @@ def comfort_dict(pipeline: Pipeline, fed: Fed) -> dict[str, Any]:
     return figures | {"cost": rides.cost(pipeline.engine, fed.state)}
 
 
-def _count(fed: Fed, batch: Batch) -> Batch:
+def _count(fed: FeedResult, batch: Batch) -> Batch:
     fed.windows.update(record.outcome for record in batch.records)
     fed.reasons.update(r.reason or "" for r in batch.records if r.outcome == "dropped")
     fed.adequate += sum(record.solved is not None and record.solved.adequate for record in batch.records)

@@ -132,7 +132,7 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     )
 
 
-class Here:
+class ThreadReading:
     """Reads in a thread of this process: for files of the user's own."""
 
     def __init__(self, request: ReadRequest) -> None:
@@ -166,7 +166,7 @@ class Here:
         self._closed.set()
 
 
-class Apart:
+class ProcessReading:
     """Reads in a process of its own: for files of strangers."""
 
     def __init__(self, request: ReadRequest, limits: ProcessLimits) -> None:
@@ -188,7 +188,7 @@ class Apart:
 
 def reading_of(request: ReadRequest, limits: ProcessLimits | None) -> Reading:
     """A recording that is about to be read: in a process of its own, or here where limits are None."""
-    return Here(request) if limits is None else Apart(request, limits)
+    return ThreadReading(request) if limits is None else ProcessReading(request, limits)
 
 
 class _Abandoned(Exception):

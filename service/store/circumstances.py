@@ -20,7 +20,7 @@ Means = dict[str, list[float]]  # name -> number of windows, mean
 
 
 @dataclass(frozen=True, slots=True)
-class Ran:
+class WindowCircumstances:
     """What is known of one window beside its estimate."""
 
     start: int  # ns since epoch
@@ -28,7 +28,7 @@ class Ran:
 
 
 @dataclass(frozen=True, slots=True)
-class RanSeries:
+class CircumstanceSeries:
     """Means over n points, oldest first."""
 
     resolution: int  # s a point
@@ -36,7 +36,7 @@ class RanSeries:
     values: dict[str, list[float | None]]  # by name; None where nobody measured it
 
 
-def add_circumstances(connection: Connection, found: Mapping[str, Sequence[Ran]], now: int) -> None:
+def add_circumstances(connection: Connection, found: Mapping[str, Sequence[WindowCircumstances]], now: int) -> None:
     """Merge windows that were stored for the first time into the minutes and hours of their vehicles."""
     fresh: dict[tuple[str, int, int], Means] = {}
     for vehicle, windows in found.items():
@@ -57,7 +57,9 @@ def add_circumstances(connection: Connection, found: Mapping[str, Sequence[Ran]]
     upsert(connection, table, rows, key=KEY)
 
 
-def circumstances_between(connection: Connection, vehicle: str, since: int, until: int, points: int) -> RanSeries:
+def circumstances_between(
+    connection: Connection, vehicle: str, since: int, until: int, points: int
+) -> CircumstanceSeries:
     """The means of since <= time < until in at most about `points` points; a point is a minute at least."""
     table = circumstances
     of_vehicle = table.c.vehicle_id == vehicle
@@ -83,7 +85,7 @@ def circumstances_between(connection: Connection, vehicle: str, since: int, unti
     values: dict[str, list[float | None]] = {
         name: [means[name][1] if name in means else None for means in merged.values()] for name in names
     }
-    return RanSeries(round(wide), list(merged), values)
+    return CircumstanceSeries(round(wide), list(merged), values)
 
 
 def _merge(into: Means, more: Mapping[str, Any]) -> None:

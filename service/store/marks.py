@@ -41,7 +41,7 @@ class MarkRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Removed:
+class RemovedVehicle:
     """What was kept of a vehicle beside the store, for the caller to delete."""
 
     upload_files: tuple[str, ...]
@@ -77,7 +77,7 @@ def retire(connection: Connection, vehicle: str, since: int | None) -> None:
     connection.execute(update(vehicles).where(vehicles.c.id == vehicle).values(retired_ns=since))
 
 
-def remove(connection: Connection, vehicle: str) -> Removed:
+def remove(connection: Connection, vehicle: str) -> RemovedVehicle:
     """Delete a vehicle with everything that is known of it; the audit log keeps that it was deleted."""
     own = recordings.c.vehicle_id == vehicle
     files = connection.execute(select(recordings.c.file).where(own, recordings.c.file.is_not(None))).scalars().all()
@@ -103,4 +103,4 @@ def remove(connection: Connection, vehicle: str) -> Removed:
     connection.execute(update(jobs).where(jobs.c.vehicle_id == vehicle).values(vehicle_id=None))
     connection.execute(delete(recordings).where(own))
     connection.execute(delete(vehicles).where(vehicles.c.id == vehicle))
-    return Removed(tuple(files), tuple(pages))
+    return RemovedVehicle(tuple(files), tuple(pages))

@@ -37,7 +37,7 @@ class RetentionLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Forgotten:
+class RetentionResult:
     """What was removed."""
 
     windows: int
@@ -46,7 +46,9 @@ class Forgotten:
     windows_for_room: int = 0  # of the windows, those that were not old
 
 
-def forget(connection: Connection, limits: RetentionLimits, keep: Keep = lambda connection, *which: None) -> Forgotten:
+def forget(
+    connection: Connection, limits: RetentionLimits, keep: Keep = lambda connection, *which: None
+) -> RetentionResult:
     """Delete what is past the limits.  One-hour roll-ups and alarms stay.
 
     keep: told of windows, by their conditions, before they are deleted.
@@ -73,7 +75,7 @@ def forget(connection: Connection, limits: RetentionLimits, keep: Keep = lambda 
     files = _old_uploads(connection, limits.uploads_before)
     if limits.upload_bytes is not None:
         files += _surplus_uploads(connection, limits.upload_bytes)
-    return Forgotten(removed + for_room, removed_minutes, tuple(files), for_room)
+    return RetentionResult(removed + for_room, removed_minutes, tuple(files), for_room)
 
 
 def _forget_windows(connection: Connection, before: int, keep: Keep) -> int:

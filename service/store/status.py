@@ -64,7 +64,7 @@ class FleetRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class StatusFilter:
     """Which vehicles are asked for."""
 
     search: str = ""  # in the id or the label
@@ -224,7 +224,7 @@ def reasons_of(connection: Connection, vehicle: str, model_id: int) -> list[Reas
 
 
 def fleet_page(
-    connection: Connection, wanted: Wanted, sort: Sort, limit: int, offset: int = 0, after: str | None = None
+    connection: Connection, wanted: StatusFilter, sort: Sort, limit: int, offset: int = 0, after: str | None = None
 ) -> list[FleetRow]:
     """`limit` vehicles; `after` is the `cursor` of the last row of the page before."""
     query = _filtered(select(vehicles.c.label, vehicles.c.retired_ns, fleet_status), wanted)
@@ -254,7 +254,7 @@ def cursor(sort: Sort, row: FleetRow) -> str:
     return f"{value}:{row.id}"
 
 
-def health_counts(connection: Connection, wanted: Wanted) -> dict[str, int]:
+def health_counts(connection: Connection, wanted: StatusFilter) -> dict[str, int]:
     """How many vehicles are in each state of health, whatever health is asked for."""
     anyhow = replace(wanted, health=None)
     query = _filtered(select(fleet_status.c.health, func.count()), anyhow).group_by(fleet_status.c.health)
@@ -263,7 +263,7 @@ def health_counts(connection: Connection, wanted: Wanted) -> dict[str, int]:
 
 def alarmed_vehicles(connection: Connection) -> list[str]:
     """Vehicles in service that are not well, the most urgent last."""
-    query = _filtered(select(fleet_status.c.vehicle_id), Wanted()).where(fleet_status.c.health != "ok")
+    query = _filtered(select(fleet_status.c.vehicle_id), StatusFilter()).where(fleet_status.c.health != "ok")
     return list(connection.execute(query.order_by(fleet_status.c.urgency)).scalars())
 
 
@@ -291,7 +291,7 @@ def without_numbers(reason: str) -> str:
     return re.sub(r"(?<![\w.])(?<!than )[-+]?\d+(\.\d+)?(?![\w.])", "N", reason)[:200]
 
 
-def _filtered(query: Select[Any], wanted: Wanted) -> Select[Any]:
+def _filtered(query: Select[Any], wanted: StatusFilter) -> Select[Any]:
     table = fleet_status
     query = query.select_from(table.join(vehicles, vehicles.c.id == table.c.vehicle_id))
     query = query.where(vehicles.c.retired_ns.is_not(None) if wanted.retired else vehicles.c.retired_ns.is_(None))

@@ -19,7 +19,7 @@ IN_LIMIT = 500  # values in one IN (...): below every dialect's bound on paramet
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
+class StoredEstimate:
     """The part of an `Estimate` that is kept."""
 
     log_ratio: FloatArray  # log(theta / nominal), shape (P,)
@@ -33,7 +33,7 @@ class Solved:
     iterations: int
 
     @classmethod
-    def of(cls, estimate: Estimate) -> Solved:
+    def of(cls, estimate: Estimate) -> StoredEstimate:
         """Keep the variances, drop the correlations: 2 kB a window that nothing reads again."""
         return cls(
             estimate.log_ratio,
@@ -87,7 +87,7 @@ class WindowRecord:
     reason: str | None
     repaired_samples: int
     tracked: bool  # False: dropped, or older than what the tracker had seen
-    solved: Solved | None  # None where dropped
+    solved: StoredEstimate | None  # None where dropped
     posterior: Posterior | None  # None where not tracked
     loads: WindowLoads = WindowLoads()  # of bodies whose load the system file names
 
@@ -214,7 +214,7 @@ def _record(row: Row[Any]) -> WindowRecord:
     solved = None
     if row.log_ratio is not None:
         identifiable: NDArray[np.bool_] = np.frombuffer(row.identifiable, np.uint8).astype(np.bool_)
-        solved = Solved(
+        solved = StoredEstimate(
             unpack(row.log_ratio),
             unpack(row.std),
             identifiable,

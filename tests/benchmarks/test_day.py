@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sprung.benchmarks import day
-from sprung.benchmarks.day import Life, Pool, library
+from sprung.benchmarks.day import Pool, VehicleLife, library
 from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.timetable import Service, draw_timetable
 from sprung.benchmarks.generator.vehicle import read_vehicle
@@ -87,12 +87,12 @@ def test_vehicles_that_are_done_are_not_lived_again(
     windows: list[Pool], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(day, "library", lambda *_: [])
-    monkeypatch.setattr(day.Lives, "pools", windows)
+    monkeypatch.setattr(day.VehicleLives, "pools", windows)
     lived = []
 
-    def live(_system: object, _windows: object, days: float, seed: int, **_: object) -> Life:
+    def live(_system: object, _windows: object, days: float, seed: int, **_: object) -> VehicleLife:
         lived.append(seed)
-        return day.Life(days, 100, 0, [], 0, None, False)
+        return day.VehicleLife(days, 100, 0, [], 0, None, False)
 
     monkeypatch.setattr(day, "live", live)
     first = list(day.run(3, 0, 7, folder=tmp_path, part="1/2"))

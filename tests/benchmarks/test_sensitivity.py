@@ -10,12 +10,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from sprung.benchmarks.sensitivity import Said, Subject, figure, quoted, run, vary
+from sprung.benchmarks.sensitivity import ReportedResult, Subject, figure, quoted, run, vary
 from sprung.benchmarks.sensitivity_cases import recordings, rig
 from sprung.model.diagnosis.rules import RULES, Rules
 
-HEALTHY = Said("consistent", (), ())
-RUBBING = Said("missing_physics", (("k1", "coulomb_friction"),), (1e-9,))
+HEALTHY = ReportedResult("consistent", (), ())
+RUBBING = ReportedResult("missing_physics", (("k1", "coulomb_friction"),), (1e-9,))
 
 
 class Obedient:
@@ -26,7 +26,7 @@ class Obedient:
     said = RUBBING
     state = object()
 
-    def again(self, stage: str, name: str, rules: Rules) -> Said:
+    def again(self, stage: str, name: str, rules: Rules) -> ReportedResult:
         value = getattr(getattr(rules, stage), name)
         return HEALTHY if value > 1.9 else replace(RUBBING, p_values=(1e-9 * value,))
 

@@ -25,7 +25,7 @@ from sprung.service.monitoring.engine import Engine
 from sprung.service.processes.worker import Emit
 from sprung.service.report import write_report
 from sprung.service.settings import Settings
-from sprung.service.store.circumstances import Ran, add_circumstances
+from sprung.service.store.circumstances import WindowCircumstances, add_circumstances
 from sprung.service.store.schema import fleet_status
 from tests.oidc_provider import provider_settings, running_provider
 from tests.report_made import friction_report
@@ -69,7 +69,10 @@ def _rides(core: Core, system: System) -> None:
     core.pipeline.process("car-17", [make_window(system, i) for i in range(80)])
     core.pipeline.process("car-17", [make_window(system, 80 + i, 0.3) for i in range(60)])
     core.pipeline.process("car-18", [make_window(system, i) for i in range(80)])
-    ran = [Ran(START + i * 10**9, {"car.load": 4e3 + 30.0 * i, "temperature": 12 + i / 40}) for i in range(140)]
+    ran = [
+        WindowCircumstances(START + i * 10**9, {"car.load": 4e3 + 30.0 * i, "temperature": 12 + i / 40})
+        for i in range(140)
+    ]
     with core.store.write() as connection:
         add_circumstances(connection, {"car-17": ran}, START)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.ambient.judgement import VARYING, AmbientJudgement, Pooled
+from sprung.model.diagnosis.ambient.judgement import VARYING, AmbientJudgement, PooledValues
 from sprung.model.diagnosis.ambient.windows import WindowResult
 from sprung.model.diagnosis.investigation.state import Options, Recorded
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
@@ -35,7 +35,7 @@ def compose_unforced(
     record: Recorded,
     options: Options,
     windows: list[WindowResult],
-    pooled: Pooled,
+    pooled: PooledValues,
     judgement: AmbientJudgement,
 ) -> Report:
     """The report of a recording without measured inputs."""
@@ -82,7 +82,7 @@ def _where(names: tuple[str, ...], judgement: AmbientJudgement) -> str:
     )
 
 
-def _values(system: System, pooled: Pooled) -> tuple[ReportedParameter, ...]:
+def _values(system: System, pooled: PooledValues) -> tuple[ReportedParameter, ...]:
     """Parameters with their means over windows."""
     ratios = zip(np.exp(pooled.log_ratio).tolist(), pooled.deviation.tolist(), strict=True)
     return tuple(
@@ -92,7 +92,7 @@ def _values(system: System, pooled: Pooled) -> tuple[ReportedParameter, ...]:
 
 
 def _findings(
-    system: System, prepared: Prepared, windows: list[WindowResult], pooled: Pooled, rules: AmbientRules
+    system: System, prepared: Prepared, windows: list[WindowResult], pooled: PooledValues, rules: AmbientRules
 ) -> list[Finding]:
     found = [
         Finding(
@@ -167,7 +167,7 @@ def _summary(verdict: str, findings: list[Finding], track: tuple[TrackPoint, ...
 
 
 def _advice(
-    system: System, pooled: Pooled, judgement: AmbientJudgement, windows: list[WindowResult], rules: AmbientRules
+    system: System, pooled: PooledValues, judgement: AmbientJudgement, windows: list[WindowResult], rules: AmbientRules
 ) -> list[str]:
     words = []
     adequate = float(np.mean([w.adequate for w in windows]))

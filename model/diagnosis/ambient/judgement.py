@@ -23,7 +23,7 @@ VARYING: dict[str, ElementLaw] = {"stiffness": TIME_VARYING_STIFFNESS, "damping"
 
 
 @dataclass(frozen=True)
-class Pooled:
+class PooledValues:
     """Values pooled over all windows."""
 
     log_ratio: FloatArray  # (P,)
@@ -44,7 +44,7 @@ class AmbientJudgement:
     rejected: bool  # whether the structure differs from the file's
 
 
-def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Pooled:
+def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> PooledValues:
     """Weighted means over windows, and the parameters that vary."""
     theta = np.array([w.log_ratio for w in windows])
     sigma = np.sqrt(np.array([np.diag(w.covariance) for w in windows]))
@@ -70,7 +70,7 @@ def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Po
         inside = 1 / np.sqrt(np.sum(1 / std**2) * number / len(std))  # overlapping windows are not independent
         between = float(np.std(value)) / np.sqrt(number) if number >= rules.independent else 0.0
         deviation[p] = max(inside, between)
-    return Pooled(mean, deviation, varying, chance)
+    return PooledValues(mean, deviation, varying, chance)
 
 
 def errors_of(
@@ -85,7 +85,7 @@ def errors_of(
 def judged(
     prepared: Prepared,
     system: System,
-    pooled: Pooled,
+    pooled: PooledValues,
     errors: HeldOutErrors,
     band: tuple[float, float],
     options: Options,

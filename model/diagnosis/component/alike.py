@@ -14,7 +14,7 @@ from sprung.model.signals import FloatArray
 
 
 @dataclass(frozen=True)
-class Alike:
+class EquivalentModel:
     """A model with one law replaced by another, or by another form of it."""
 
     index: int
@@ -31,7 +31,7 @@ class Alike:
         return moved_in_common(self.fit, self.found)
 
 
-def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple[Alike, ...]:
+def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple[EquivalentModel, ...]:
     """Look-alikes of the laws of a model, which were found in `steps` and begin at index `first`.
 
     These are the laws of almost the same evidence.  If the model leaves more than noise it is not exact, and evidence
@@ -41,12 +41,12 @@ def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple
     here, found = refined(task, final.model), []
     for index, step in enumerate(steps, first):
         valve = low_valve(here, index)
-        found += [Alike(index, valve, here)] if valve is not None and _as_well(valve, here) else []
+        found += [EquivalentModel(index, valve, here)] if valve is not None and _as_well(valve, here) else []
         near = step.chosen.evidence - task.rules.naming_margin
         for other in (*step.rivals, *step.forms):
             if other.evidence > near or here.leaves_more:
                 model = final.model.replaced(index, other.last, other.fit.model.shapes[-1])
-                one = Alike(index, refined(task, model), here)
+                one = EquivalentModel(index, refined(task, model), here)
                 found += (
                     [one] if other.evidence > near or (plausible(one.fit, index) and _as_well(one.fit, here)) else []
                 )

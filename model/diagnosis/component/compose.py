@@ -9,7 +9,7 @@ import numpy as np
 from sprung.model.diagnosis.component.deviations import covariance, spread
 from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.given import identified_laws
-from sprung.model.diagnosis.component.judgement import ComponentJudgement, Judged
+from sprung.model.diagnosis.component.judgement import ComponentJudgement, JudgedComponent
 from sprung.model.diagnosis.component.piece import Lag
 from sprung.model.diagnosis.component.words import (
     finding_of,
@@ -38,7 +38,7 @@ from sprung.model.system import System
 
 
 def compose_components(
-    system: System, record: Recorded, options: Options, judged: Sequence[Judged], judgement: ComponentJudgement
+    system: System, record: Recorded, options: Options, judged: Sequence[JudgedComponent], judgement: ComponentJudgement
 ) -> Report:
     """The report of component tests."""
     errors, left = judgement.errors, judgement.left
@@ -79,7 +79,7 @@ def _rank(finding: Finding) -> tuple[int, float]:
     return order, finding.delta_bic if finding.delta_bic is not None else 0.0
 
 
-def _findings(one: Judged) -> list[Finding]:
+def _findings(one: JudgedComponent) -> list[Finding]:
     full, names = one.covariance
     findings = []
     if one.reversed:
@@ -105,7 +105,7 @@ def _findings(one: Judged) -> list[Finding]:
     return findings
 
 
-def _laws(one: Judged) -> tuple[IdentifiedLaw, ...]:
+def _laws(one: JudgedComponent) -> tuple[IdentifiedLaw, ...]:
     """Laws for the system file: given and named ones, and the preload."""
     count = len(one.record.given.pieces) + (len(one.found.steps) if one.named else 0)
     return identified_laws(one.final, one.record.element, count, *one.covariance, -1.0 if one.reversed else 1.0)
@@ -126,7 +126,7 @@ def _parameters(
     return values
 
 
-def _candidates(one: Judged) -> list[CandidateRow]:
+def _candidates(one: JudgedComponent) -> list[CandidateRow]:
     rows: dict[str, CandidateRow] = {}
     for step in one.found.steps:
         for ranked in (step.chosen, *step.rivals):
@@ -159,7 +159,7 @@ def _summary(judgement: ComponentJudgement, findings: list[Finding], left: Unexp
     return f"{text}{'; ' + nuisance if nuisance else ''}."
 
 
-def _arrays(judged: Sequence[Judged]) -> dict[str, np.ndarray]:
+def _arrays(judged: Sequence[JudgedComponent]) -> dict[str, np.ndarray]:
     """Arrays for plots: validation of every force; motion and force before and after every law."""
     first = judged[0]
     arrays: dict[str, np.ndarray] = {}
@@ -188,7 +188,7 @@ def _arrays(judged: Sequence[Judged]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _columns_of_findings(one: Judged) -> list[slice]:
+def _columns_of_findings(one: JudgedComponent) -> list[slice]:
     """Columns of the model for every finding: of one law, or of all laws of an unnamed force."""
     counts = [len(piece.signs) for piece in one.final.model.pieces]
     given, steps = len(one.record.given.pieces), len(one.found.steps)

@@ -10,7 +10,7 @@ import numpy as np
 from sprung.model.diagnosis.component.compose import compose_components
 from sprung.model.diagnosis.component.fit import fitted, refined
 from sprung.model.diagnosis.component.formula import formula_search
-from sprung.model.diagnosis.component.judgement import Judged, concluded
+from sprung.model.diagnosis.component.judgement import JudgedComponent, concluded
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
 from sprung.model.diagnosis.component.piece import HYSTERESIS, SURFACE, Piece
 from sprung.model.diagnosis.component.pieces import PIECES
@@ -66,13 +66,15 @@ def _of_element(law: Law) -> bool:
     return isinstance(law, ElementLaw) and law.where == "element" and not law.nuisance
 
 
-def _judge(one: ComponentRecord, pieces: tuple[Piece, ...], rules: VerdictRules, progress: PieceProgress) -> Judged:
+def _judge(
+    one: ComponentRecord, pieces: tuple[Piece, ...], rules: VerdictRules, progress: PieceProgress
+) -> JudgedComponent:
     turned = turned_round(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
     found = search(one.task, (*pieces, *one.own), progress, one.given)
     base, final = found.base, found.final
-    judged = Judged(one, found, base, final, final.floor, turned)
+    judged = JudgedComponent(one, found, base, final, final.floor, turned)
     alone = _only_one_loop(judged)
     if alone:
         judged = replace(judged, record=replace(one, notes=(*one.notes, f"{one.element}: {_ONE_LOOP}")))
@@ -92,7 +94,7 @@ def _judge(one: ComponentRecord, pieces: tuple[Piece, ...], rules: VerdictRules,
     return judged
 
 
-def _only_one_loop(judged: Judged) -> bool:
+def _only_one_loop(judged: JudgedComponent) -> bool:
     """Whether hysteresis beside other laws was observed along a single loop, which such sums can always imitate.
 
     The held-out part repeats the same loop and cannot refute them.
@@ -109,7 +111,7 @@ def _least(steps: tuple[Step, ...], rules: ComponentRules) -> float:
     return rules.named if one else 1 - rules.together
 
 
-def _established(judged: Judged, rules: VerdictRules) -> Judged:
+def _established(judged: JudgedComponent, rules: VerdictRules) -> JudgedComponent:
     """With the first law only, if it suffices and several laws leave too much to be named.
 
     If the first does not suffice, all are kept as the closest approximation, and none is named.
@@ -125,7 +127,7 @@ def _established(judged: Judged, rules: VerdictRules) -> Judged:
     return one if alone is not None and alone >= _least(steps[:1], task.rules) else judged
 
 
-def _with_formula(judged: Judged, rules: VerdictRules) -> Judged | None:
+def _with_formula(judged: JudgedComponent, rules: VerdictRules) -> JudgedComponent | None:
     """With a formula for the unexplained force, if one explains as much as a law must."""
     with np.errstate(all="ignore"):  # trial formulas overflow
         found = formula_search(judged.record.task, judged.record.given)
@@ -136,7 +138,7 @@ def _with_formula(judged: Judged, rules: VerdictRules) -> Judged | None:
     return candidate if share is not None and share >= judged.record.task.rules.named else None
 
 
-def _closest(judged: Judged) -> Judged:
+def _closest(judged: JudgedComponent) -> JudgedComponent:
     """With the single law that predicts best, if it predicts better than the insufficient combination."""
     task, found = judged.final.task, judged.found
     alone = [replace(ranked, fit=fitted(task, ranked.fit.model)) for ranked in found.alone]
@@ -150,7 +152,7 @@ def _closest(judged: Judged) -> Judged:
     return replace(judged, found=replace(found, steps=(step,)), final=best.fit, floor=best.fit.floor)
 
 
-def _with_surface(judged: Judged) -> Judged:
+def _with_surface(judged: JudgedComponent) -> JudgedComponent:
     """With the remainder as an unnamed force, if that improves the held-out part.
 
     The law beside it is chosen by prediction only and has no meaning.

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
 from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.piece import Lag, Part, Seen, Values
+from sprung.model.diagnosis.component.piece import Lag, MotionSizes, Part, Values
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.along import force_along
@@ -50,8 +50,8 @@ class ComponentTask:
     lag: float = 0.0  # s, time constant of a first-order filter of the force channel
 
     @cached_property
-    def seen(self) -> Seen:
-        return Seen.of(self.motion, self.rules)
+    def seen(self) -> MotionSizes:
+        return MotionSizes.of(self.motion, self.rules)
 
     def through(self, channel: SensorResponse) -> ComponentTask:
         """The same with delay and filter of the force channel."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from sprung.model.diagnosis.component.deviations import covariance, spread
 from sprung.model.diagnosis.component.fit import ComponentModel, ComponentTask, refined
-from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, Piece, Seen, Shape
+from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, MotionSizes, Piece, Shape
 from sprung.model.diagnosis.component.search import Ranked, Search, Step, next_laws
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance
@@ -48,7 +48,7 @@ def formula_piece(law: ElementLaw, grid: FloatArray | None = None, parts: int = 
         values = dict(zip(amplitudes, map(float, strengths), strict=True)) | dict(zip(others, shape, strict=True))
         return tuple(values[i] for i in range(len(law.parameters)))
 
-    def limits(seen: Seen) -> list[tuple[float, float]]:
+    def limits(seen: MotionSizes) -> list[tuple[float, float]]:
         sizes = {"m": seen.travel, "m/s": seen.rate_rms}
         return [
             (sizes[unit] / seen.reach, sizes[unit] * seen.reach) if unit in sizes else (seen.step, seen.seconds)
@@ -133,7 +133,7 @@ def _single(form: Form, seen: Observed) -> FormulaPiece:
     return formula_piece(law, law.shapes(seen)[:, 1:], form.parts)
 
 
-def _pair(one: Form, shape: Shape, other: Form, piece: FormulaPiece, seen: Seen) -> FormulaPiece:
+def _pair(one: Form, shape: Shape, other: Form, piece: FormulaPiece, seen: MotionSizes) -> FormulaPiece:
     """A pair of a shape at its best values and another with all its trial values."""
     trials = piece.grid(seen)
     rows = np.column_stack([np.tile(np.array(shape, dtype=float), (len(trials), 1)), trials])

@@ -21,7 +21,7 @@ _RAMP = 0.6  # of the lowest frequency, start of the filter's transition
 
 
 @dataclass(frozen=True)
-class Integrated:
+class IntegratedMotion:
     """Motion from an acceleration; NaN at the ends."""
 
     displacement: FloatArray  # m, (T,)
@@ -31,7 +31,7 @@ class Integrated:
     lowest: float  # Hz, edge of the filter
 
 
-def integrated(acceleration: FloatArray, sample_rate: float, rules: ComponentRules) -> Integrated | None:
+def integrated(acceleration: FloatArray, sample_rate: float, rules: ComponentRules) -> IntegratedMotion | None:
     """Motion from an acceleration (T,), m/s^2; None if it contains nothing but noise."""
     good = np.isfinite(acceleration)
     at = np.arange(len(acceleration))
@@ -57,7 +57,7 @@ def integrated(acceleration: FloatArray, sample_rate: float, rules: ComponentRul
     deviations = [noise * float(np.sqrt(2 * np.sum((passed / omega**p) ** 2) / len(whole))) for p in (1, 2)]
     lost = int(rules.integral_settled * sample_rate / lowest)
     known = good & (at >= lost) & (at < len(series) - lost)
-    return Integrated(
+    return IntegratedMotion(
         np.where(known, displacement, np.nan), np.where(known, velocity, np.nan), deviations[1], deviations[0], lowest
     )
 

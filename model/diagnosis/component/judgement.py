@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sprung.model.diagnosis.component.alike import Alike, look_alikes
+from sprung.model.diagnosis.component.alike import EquivalentModel, look_alikes
 from sprung.model.diagnosis.component.deviations import covariance, left_open
 from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.measured import ComponentRecord
@@ -20,7 +20,7 @@ from sprung.model.signals import FloatArray
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedComponent:
     """One component with the results that are reported."""
 
     record: ComponentRecord
@@ -49,7 +49,7 @@ class Judged:
         return full + left_open(self.final, [one.moved for one in self.alike]), names
 
     @cached_property
-    def alike(self) -> tuple[Alike, ...]:
+    def alike(self) -> tuple[EquivalentModel, ...]:
         """Look-alikes of the named laws."""
         return look_alikes(self.final, self.found.steps if self.named else (), len(self.record.given.pieces))
 
@@ -75,7 +75,7 @@ class ComponentJudgement:
     left: FloatArray  # unexplained share of every force's power
 
 
-def concluded(judged: Sequence[Judged], rules: Rules) -> ComponentJudgement:
+def concluded(judged: Sequence[JudgedComponent], rules: Rules) -> ComponentJudgement:
     """The common verdict of all tests."""
     parts = [one.errors for one in judged]
     errors = HeldOutErrors(*(np.concatenate([getattr(e, key) for e in parts]) for key in ("before", "after", "floor")))
@@ -87,7 +87,7 @@ def concluded(judged: Sequence[Judged], rules: Rules) -> ComponentJudgement:
     return ComponentJudgement(errors, verdict, explained, errors.unexplained(deciding))
 
 
-def _speaks(one: Judged) -> Iterator[tuple[EffectKind, float]]:
+def _speaks(one: JudgedComponent) -> Iterator[tuple[EffectKind, float]]:
     """Kinds of all findings with their delta BIC, most negative first; preloads are nuisances."""
     if one.reversed:
         yield kind_of(SIGN_REVERSED), -np.inf

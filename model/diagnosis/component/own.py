@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, FittedPiece, Piece, Seen, Shape
+from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, FittedPiece, MotionSizes, Piece, Shape
 from sprung.model.laws import ElementLaw, Law, Observed, SpringDamper, observe
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
@@ -69,7 +69,7 @@ def own_piece(law: ElementLaw, seen: Observed) -> Piece | None:
         whole = float(fitted.strengths[0]) / of_element(fitted.element)
         return strong is not None or abs(whole - 1) < fitted.rules.lost
 
-    def limits(sizes: Seen) -> list[tuple[float, float]]:
+    def limits(sizes: MotionSizes) -> list[tuple[float, float]]:
         return [_limits(law, i, seen, sizes.reach) for i in others]
 
     return Piece(

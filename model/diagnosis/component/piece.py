@@ -33,7 +33,7 @@ _MEDIAN_OF_NORMAL = 0.6745  # of the magnitude, over the deviation
 
 
 @dataclass(frozen=True)
-class Seen:
+class MotionSizes:
     """Sizes of a motion, which bound knees, gaps and yield displacements."""
 
     travel: float  # m, half of the range
@@ -45,7 +45,7 @@ class Seen:
     latest: float  # s, of the delay of a channel
 
     @classmethod
-    def of(cls, motion: ElementMotion, rules: ComponentRules = RULES.component) -> Seen:
+    def of(cls, motion: ElementMotion, rules: ComponentRules = RULES.component) -> MotionSizes:
         quantiles = np.quantile(np.abs(motion.rate), np.linspace(0, 1, 101))
         travel = 0.5 * float(np.ptp(motion.deflection))
         rate, seconds = np.maximum(quantiles, 1e-12), len(motion.time) * motion.step
@@ -101,8 +101,8 @@ class Piece:
 
     law: ElementLaw
     shapes: tuple[str, ...]  # names of the nonlinear values
-    grid: Callable[[Seen], FloatArray]  # trial shapes, (trials, shapes)
-    limits: Callable[[Seen], list[tuple[float, float]]]  # of every shape
+    grid: Callable[[MotionSizes], FloatArray]  # trial shapes, (trials, shapes)
+    limits: Callable[[MotionSizes], list[tuple[float, float]]]  # of every shape
     signs: tuple[int, ...]  # of the strengths: 1, -1, 0 for either
     parameters: Parameters  # of the law, by strengths, shapes and element; linear in the strengths
     shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # by the law's parameters
@@ -209,10 +209,10 @@ class Following:
     def signs(self) -> tuple[int, ...]:
         return (*self.piece.signs, *(0 for _ in self.piece.signs))
 
-    def grid(self, seen: Seen) -> FloatArray:
+    def grid(self, seen: MotionSizes) -> FloatArray:
         return self.piece.grid(seen)
 
-    def limits(self, seen: Seen) -> list[tuple[float, float]]:
+    def limits(self, seen: MotionSizes) -> list[tuple[float, float]]:
         return self.piece.limits(seen)
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
@@ -259,11 +259,11 @@ class SliderSurface:
     def signs(self) -> tuple[int, ...]:
         return (0,) * (len(_REACHES) + len(_RATES) + 6)
 
-    def limits(self, seen: Seen) -> list[tuple[float, float]]:
+    def limits(self, seen: MotionSizes) -> list[tuple[float, float]]:
         return []
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
-        seen = Seen.of(motion)
+        seen = MotionSizes.of(motion)
         x, v = (motion.deflection - motion.middle) / seen.travel, motion.rate / max(seen.rate_rms, 1e-12)
         path, stride = motion.followed.deflection, motion.stride
         columns = [stop_path(path, reach * seen.travel)[::stride] / (reach * seen.travel) for reach in _REACHES]
@@ -307,11 +307,11 @@ class Lag:
         """Delay and filter of the channel."""
         return SensorResponse(lag=shape[0]) if self.filters else SensorResponse(delay=shape[0])
 
-    def grid(self, seen: Seen) -> FloatArray:
+    def grid(self, seen: MotionSizes) -> FloatArray:
         late = np.geomspace(2e-4, seen.latest, 12)
         return (late if self.filters else np.concatenate([late, -late]))[:, None]
 
-    def limits(self, seen: Seen) -> list[tuple[float, float]]:
+    def limits(self, seen: MotionSizes) -> list[tuple[float, float]]:
         return [(1e-5 if self.filters else -1.5 * seen.latest, 1.5 * seen.latest)]
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
@@ -332,10 +332,10 @@ LawPiece = Piece | Following | Lag  # candidates of the search
 Part = LawPiece | SliderSurface
 
 
-def no_shapes(seen: Seen) -> FloatArray:
+def no_shapes(seen: MotionSizes) -> FloatArray:
     """The grid of a piece without shapes."""
     return np.zeros((1, 0))
 
 
-def rates_at(seen: Seen, shares: Sequence[float]) -> FloatArray:
+def rates_at(seen: MotionSizes, shares: Sequence[float]) -> FloatArray:
     return np.interp(shares, np.linspace(0, 1, 101), seen.rate)

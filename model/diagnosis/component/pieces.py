@@ -14,8 +14,8 @@ from sprung.model.diagnosis.component.piece import (
     FRICTION,
     HYSTERESIS,
     FittedPiece,
+    MotionSizes,
     Piece,
-    Seen,
     Shape,
     Values,
     no_shapes,
@@ -38,15 +38,15 @@ _SHARPEST = 1e-6  # distance of an exponent from 1 below which it is 1
 _POLYTROPIC = 1.3  # of a gas; not identifiable beside the column's length at usual rates
 
 
-def _yields(seen: Seen) -> FloatArray:
+def _yields(seen: MotionSizes) -> FloatArray:
     return seen.travel * np.geomspace(0.004, 0.8, 9)
 
 
-def _yield_limits(seen: Seen) -> tuple[float, float]:
+def _yield_limits(seen: MotionSizes) -> tuple[float, float]:
     return (2e-4 * seen.travel, 0.8 * seen.travel)  # a larger yield displacement is a softening spring
 
 
-def _knee_limits(seen: Seen) -> tuple[float, float]:
+def _knee_limits(seen: MotionSizes) -> tuple[float, float]:
     return (seen.lowest_knee, float(seen.rate[97]))
 
 

@@ -113,7 +113,7 @@ def search(
 
 
 @dataclass(frozen=True)
-class _Grown:
+class _SelectedLaws:
     """A model with the steps that led to it."""
 
     current: Ranked
@@ -121,7 +121,7 @@ class _Grown:
     first: tuple[Ranked, ...]  # models with one law, best first
 
 
-def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, progress: Progress) -> _Grown:
+def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, progress: Progress) -> _SelectedLaws:
     """Forward selection until the residual is noise, or no law explains enough of it."""
     task, rules, given = base.task, base.task.rules, len(base.model.pieces)
     current = Ranked(base, 0.0, 0.0, effective_count(base.residual[: task.split]))
@@ -141,10 +141,10 @@ def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, progres
         current = _swapped(step.chosen, pieces, rules, given)
         if current is not step.chosen:  # an earlier law was exchanged
             steps = _renamed(steps, current, given, tests)
-    return _Grown(current, tuple(steps), first)
+    return _SelectedLaws(current, tuple(steps), first)
 
 
-def _plainer_of(one: _Grown, other: _Grown, rules: ComponentRules) -> _Grown:
+def _plainer_of(one: _SelectedLaws, other: _SelectedLaws, rules: ComponentRules) -> _SelectedLaws:
     """The one that predicts the held-out part better; of two equal ones, that of commoner laws."""
     fits = [grown.current.fit for grown in (one, other)]
     best = min(fit.held_out for fit in fits)

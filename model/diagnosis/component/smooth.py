@@ -13,7 +13,7 @@ import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit, refined
 from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.piece import ELASTIC, Piece, Seen, Shape, SliderSurface
+from sprung.model.diagnosis.component.piece import ELASTIC, MotionSizes, Piece, Shape, SliderSurface
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray
 
@@ -31,7 +31,7 @@ class SmoothSpring(SliderSurface):
         return (0,) * self.powers
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
-        x = (motion.deflection - motion.middle) / Seen.of(motion).travel
+        x = (motion.deflection - motion.middle) / MotionSizes.of(motion).travel
         return np.column_stack([x**power for power in range(2, self.powers + 2)])
 
 

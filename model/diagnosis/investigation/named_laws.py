@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from sprung.model.diagnosis.investigation.state import Found, Investigation, Progress
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
 from sprung.model.diagnosis.selection.compete import noise_bound
 from sprung.model.laws import ElementLaw
 
@@ -42,7 +42,7 @@ def _needs_no_names(unnamed: Investigation) -> bool:
     return trial.named and not (_is_formula(unnamed.found[-1]) and _excess_chi_square(unnamed, unnamed) > 0)
 
 
-def _is_formula(found: Found) -> bool:
+def _is_formula(found: AcceptedFinding) -> bool:
     law = found.trial.term.law
     return isinstance(law, ElementLaw) and law.of_formula
 

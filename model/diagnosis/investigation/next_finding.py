@@ -19,7 +19,7 @@ from sprung.model.diagnosis.investigation.formula_trial import with_formula
 from sprung.model.diagnosis.investigation.masses import imitates_errors, with_errors_instead
 from sprung.model.diagnosis.investigation.minor import is_minor, untried
 from sprung.model.diagnosis.investigation.setup import misfit
-from sprung.model.diagnosis.investigation.state import Found, Investigation, Progress
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.investigation.widened import (
     adopt_wider,
@@ -90,7 +90,7 @@ def _with_leading(state: Investigation, competition: _Competition, progress: Cal
     second = runner_up(state.problem, state.fit, untried(state, state.last.candidates), chosen, competition.believed)
     state, trial = _refitted(state, chosen, trials)
     rivals = tuple(t for t in trials if t is not trial)
-    found = Found(trial, rivals, second, p_value, tuple(t for t, _ in competition.implausible))
+    found = AcceptedFinding(trial, rivals, second, p_value, tuple(t for t, _ in competition.implausible))
     progress("screening the residual")
     last = screen(state.problem, state.fit, state.problem.system.catalogue, state.options.project)
     return replace(state, found=(*state.found, found), last=last, notes=(*state.notes, *note))

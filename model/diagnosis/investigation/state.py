@@ -89,7 +89,7 @@ class Nominal:
 
 
 @dataclass(frozen=True)
-class Found:
+class AcceptedFinding:
     """One accepted finding with its rivals."""
 
     trial: Trial
@@ -100,7 +100,7 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Widened:
+class WidenedFit:
     """A fit with one of its laws wider."""
 
     fit: Fit
@@ -115,7 +115,7 @@ class TriedWider:
     """Result of the wider forms of a fit's laws."""
 
     of: Fit
-    best: Widened | None  # None: no law has one
+    best: WidenedFit | None  # None: no law has one
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Investigation:
     held: HeldOut
     first: Screening
     last: Screening
-    found: tuple[Found, ...] = ()
+    found: tuple[AcceptedFinding, ...] = ()
     input_faults: tuple[InputFault, ...] = ()
     setup_faults: tuple[SetupFault, ...] = ()
     notes: tuple[str, ...] = ()

@@ -15,7 +15,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
-from sprung.model.diagnosis.investigation.state import Investigation, TriedWider, Widened
+from sprung.model.diagnosis.investigation.state import Investigation, TriedWider, WidenedFit
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import WIDER, Term
@@ -37,13 +37,13 @@ def with_wider_tried(state: Investigation) -> Investigation:
     return replace(state, wider=TriedWider(state.fit, _best_widened(state)))
 
 
-def best_wider(state: Investigation) -> Widened | None:
+def best_wider(state: Investigation) -> WidenedFit | None:
     """The best wider form of a law of the present fit, if forms were tried and a law has one."""
     known = state.wider
     return known.best if known is not None and known.of is state.fit else None
 
 
-def _best_widened(state: Investigation) -> Widened | None:
+def _best_widened(state: Investigation) -> WidenedFit | None:
     """The wider form of highest evidence among the laws found so far; None: no law has one."""
     if state.problem.process_noise:
         return None
@@ -57,7 +57,7 @@ def _best_widened(state: Investigation) -> Widened | None:
     return max(judged, key=lambda one: one.evidence, default=None)
 
 
-def is_better(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
+def is_better(state: Investigation, wide: WidenedFit, trials: list[Trial]) -> bool:
     """Whether the wider form of a law found explains more than the best of the next trials."""
     if wide.evidence <= 0 or doubt(wide.fit, wide.fit.point.terms[wide.index], state.options.rules.plausible):
         return False
@@ -69,7 +69,7 @@ def is_better(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
     return not (held_out and state.held.compare(state.fit, wide.fit).refuted)
 
 
-def adopt_wider(state: Investigation, wide: Widened) -> Investigation:
+def adopt_wider(state: Investigation, wide: WidenedFit) -> Investigation:
     """The investigation with a law that was found in its wider form."""
     problem, fit = refreshed(state.problem, wide.fit)
     last = screen(problem, fit, state.problem.system.catalogue, state.options.project)
@@ -134,13 +134,13 @@ def _widened(state: Investigation, index: int) -> Fit | None:
     return best
 
 
-def _judged(state: Investigation, index: int, fit: Fit, quiet: float) -> Widened:
+def _judged(state: Investigation, index: int, fit: Fit, quiet: float) -> WidenedFit:
     """Evidence of the wider form over the present fit."""
     base, rules = state.fit, state.problem.rules.evidence
     gain = profile_gain(base.residual, fit.residual, len(state.problem.sensors), quiet, rules)
     fall = base.chi_square - fit.chi_square
     gain = min(gain, fall)
-    return Widened(fit, index, fall, gain, gain - _cost(state, fit, index))
+    return WidenedFit(fit, index, fall, gain, gain - _cost(state, fit, index))
 
 
 def _cost(state: Investigation, fit: Fit, index: int) -> float:

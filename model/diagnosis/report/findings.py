@@ -8,7 +8,7 @@ import numpy as np
 
 from sprung.model.diagnosis.investigation.calibration import faulty, within_tolerance
 from sprung.model.diagnosis.investigation.setup import SetupFault
-from sprung.model.diagnosis.investigation.state import Found, InputFault, NoiseFault, Outcome
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of
@@ -100,7 +100,7 @@ def _free(term: Term, parameters: tuple[LawParameter, ...]) -> tuple[LawParamete
     return tuple(one for one, fixed in zip(parameters, term.fixed, strict=True) if not fixed)
 
 
-def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | None]:
+def _look_alikes(found: AcceptedFinding, rules: ReportRules) -> tuple[str | None, str | None]:
     """Look-alikes of a law at its place, in words, and the experiment that would distinguish them.
 
     A law of more evidence with implausible values is included.
@@ -117,7 +117,7 @@ def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | No
     return names, f"{names} fit this recording almost equally well; {_experiment(best.term)} would tell them apart"
 
 
-def _elsewhere(found: Found, rules: ReportRules) -> tuple[str, ...]:
+def _elsewhere(found: AcceptedFinding, rules: ReportRules) -> tuple[str, ...]:
     """Other places at which the chosen law explains the recording almost equally well.
 
     Without measured forces, a heavier body is equivalent to a lighter other one.
@@ -128,7 +128,7 @@ def _elsewhere(found: Found, rules: ReportRules) -> tuple[str, ...]:
     return tuple(dict.fromkeys(place for place in places if place != best.term.location))
 
 
-def _beaten(found: Found) -> dict[str, float]:
+def _beaten(found: AcceptedFinding) -> dict[str, float]:
     """Fitted look-alikes of a law, with the evidence by which they lost."""
     best, beaten = found.trial, dict[str, float]()
     for rival in found.trials:

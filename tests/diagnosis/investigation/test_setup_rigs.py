@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sprung.benchmarks.setup_rigs import RIGS, Rig, RigRecord, Wrong, recorded
+from sprung.benchmarks.setup_rigs import RIGS, ChannelErrors, Rig, RigRecord, recorded
 from sprung.model.diagnosis.api import diagnose
 
 HALF_CAR, BUILDING, _ = RIGS
@@ -17,13 +17,15 @@ FRONT = ("road_front.displacement", "road_front.velocity")
 @pytest.mark.parametrize(
     ("rig", "wrong", "value"),
     [
-        (HALF_CAR, Wrong("node_delay", FRONT, late=3), 0.03),  # one wheel alone below its axle
-        pytest.param(BUILDING, Wrong("node_delay", ("table.acceleration",), late=5), 0.05, marks=pytest.mark.slow),
-        pytest.param(BUILDING, Wrong("node_delay", ("a1", "a2", "a3"), late=3), 0.03, marks=pytest.mark.slow),
-        (BUILDING, Wrong("wrong_scale", ("table.acceleration",), factor=1 / 9.80665), 1 / 9.80665),
+        (HALF_CAR, ChannelErrors("node_delay", FRONT, late=3), 0.03),  # one wheel alone below its axle
+        pytest.param(
+            BUILDING, ChannelErrors("node_delay", ("table.acceleration",), late=5), 0.05, marks=pytest.mark.slow
+        ),
+        pytest.param(BUILDING, ChannelErrors("node_delay", ("a1", "a2", "a3"), late=3), 0.03, marks=pytest.mark.slow),
+        (BUILDING, ChannelErrors("wrong_scale", ("table.acceleration",), factor=1 / 9.80665), 1 / 9.80665),
     ],
 )
-def test_a_wrong_set_up_is_named_at_its_channels(rig: Rig, wrong: Wrong, value: float) -> None:
+def test_a_wrong_set_up_is_named_at_its_channels(rig: Rig, wrong: ChannelErrors, value: float) -> None:
     system, values = recorded(replace(rig, seconds=SECONDS[rig.file]), np.random.default_rng(3), SPREAD[rig.file])
     record = RigRecord(wrong.of([channel.name for channel in system.channels], values), system.sample_rate)
     report = diagnose(system, record)

@@ -15,7 +15,7 @@ from sprung.model.diagnosis.fit import baseline
 from sprung.model.diagnosis.investigation.calibration import centred, shared_gain, with_free_gains
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.significance import without_insignificant
-from sprung.model.diagnosis.investigation.state import Found, Investigation
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.selection.compete import compete
@@ -30,7 +30,7 @@ def _heavier(ratio: float) -> Investigation:
     state = begun(system, simulate(seconds=10.0, seed=46), Options(), lambda share, text: None)
     candidate = next(one for one in state.first.candidates if one.term.key[:2] == ("car", "mass_change"))
     (trial,) = compete(state.problem, state.fit, [candidate])
-    return replace(state, fit=trial.fit, found=(Found(trial, (), None, 1e-9),))
+    return replace(state, fit=trial.fit, found=(AcceptedFinding(trial, (), None, 1e-9),))
 
 
 @pytest.mark.parametrize(("ratio", "kept"), [(1.0, 0), (1.2, 1)])

@@ -17,10 +17,10 @@ from sprung.service.monitoring.engine import Engine, make_tracker
 from sprung.service.monitoring.views import running, window_dict
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet
-from sprung.service.store.circumstances import Ran, add_circumstances, circumstances_between
+from sprung.service.store.circumstances import WindowCircumstances, add_circumstances, circumstances_between
 from sprung.service.store.marks import remove
 from sprung.service.store.schema import circumstances
-from sprung.service.store.windows import Posterior, Solved, WindowLoads, WindowRecord
+from sprung.service.store.windows import Posterior, StoredEstimate, WindowLoads, WindowRecord
 from tests.service_fakes import FakeIdentifier, make_window
 
 SECOND = 10**9
@@ -36,10 +36,13 @@ def test_means_are_of_all_windows_however_they_came(store: Store) -> None:
         for first in range(0, 7200, 700):  # in pieces that split minutes
             part = range(first, min(first + 700, 7200))
             ran = [
-                Ran(START + i * SECOND, {"car.load": loads[i]} | ({"temperature": 3.0} if i < 60 else {})) for i in part
+                WindowCircumstances(
+                    START + i * SECOND, {"car.load": loads[i]} | ({"temperature": 3.0} if i < 60 else {})
+                )
+                for i in part
             ]
             add_circumstances(connection, {"a": ran}, 1)
-        add_circumstances(connection, {"a": [Ran(START, {})]}, 1)  # nothing known: nothing kept
+        add_circumstances(connection, {"a": [WindowCircumstances(START, {})]}, 1)  # nothing known: nothing kept
         minutes = circumstances_between(connection, "a", START, START + 2 * HOUR, 2000)
         hours = circumstances_between(connection, "a", START, START + 2 * HOUR, 2)
         part_of = circumstances_between(connection, "a", START + HOUR, START + HOUR + 60 * SECOND, 2000)
@@ -53,7 +56,7 @@ def test_means_are_of_all_windows_however_they_came(store: Store) -> None:
 def test_they_go_with_their_vehicle(store: Store) -> None:
     with store.write() as connection:
         fleet.ensure_vehicle(connection, "a", 1)
-        add_circumstances(connection, {"a": [Ran(START, {"speed": 20.0})]}, 1)
+        add_circumstances(connection, {"a": [WindowCircumstances(START, {"speed": 20.0})]}, 1)
         remove(connection, "a")
         assert connection.execute(circumstances.select()).all() == []
 
@@ -101,7 +104,9 @@ def test_the_load_is_a_parameter_of_windows_where_the_system_file_names_it(decla
     system = parse_system(text.replace(empty, "position: [0.0, 0.0], load: true}", 1) if declared else text)
     engine = Engine(system, FakeIdentifier(system), make_tracker(system))
     P, S = len(system.tracked), len(system.sensors)
-    solved = Solved(np.zeros(P), np.full(P, 0.01), np.ones(P, dtype=bool), 0.03, np.full(S, 0.03), 1.0, True, True, 2)
+    solved = StoredEstimate(
+        np.zeros(P), np.full(P, 0.01), np.ones(P, dtype=bool), 0.03, np.full(S, 0.03), 1.0, True, True, 2
+    )
     loads = WindowLoads({"car": (3100.0, 400.0)}, {"car": (2950.0, 60.0)})
     record = WindowRecord(START, "used", None, 0, True, solved, Posterior(solved.log_ratio, solved.std), loads)
     line = window_dict(engine, record)

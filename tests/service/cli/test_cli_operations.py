@@ -30,7 +30,7 @@ from sprung.service.cli.replay import incomplete_line, measurement_lines, slower
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.views import vehicle_view
 from sprung.service.rendering.render import percent
-from sprung.service.sources.feed import Fed
+from sprung.service.sources.feed import FeedResult
 from sprung.service.store import open_store
 from sprung.service.store.fleet import ensure_vehicle
 from tests.report_made import friction_report
@@ -259,7 +259,7 @@ def test_a_free_body_is_a_legal_system(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_a_replay_that_is_slower_than_asked_says_so() -> None:
-    fed = Fed("a", recorded_seconds=100.0, wall_seconds=20.0)
+    fed = FeedResult("a", recorded_seconds=100.0, wall_seconds=20.0)
     assert slower_line(fed, 60.0) == (
         "--speed 60 was asked for and 5 reached: this machine, busy as it is, is no faster"
     )
@@ -268,7 +268,7 @@ def test_a_replay_that_is_slower_than_asked_says_so() -> None:
 
 
 def test_what_a_recording_lost_is_counted_in_words() -> None:
-    fed = Fed("a", Counter(used=8, repaired=1, dropped=1), Counter({"gap in x": 1}), late=2)
+    fed = FeedResult("a", Counter(used=8, repaired=1, dropped=1), Counter({"gap in x": 1}), late=2)
     assert incomplete_line(Path("a.mcap"), fed) == (
         "a.mcap: not monitored: 1 window repaired, 1 window dropped (gap in x: 1), 2 windows not tracked: older than "
         "what was known of a; 10 windows in all"

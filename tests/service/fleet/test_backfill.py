@@ -148,7 +148,7 @@ def test_a_backfill_that_was_interrupted_goes_on(
     with pytest.raises(StoppedHere):
         backfill(plan, Dying(), 2, shown)
     with any_store.read() as connection:
-        assert status.fleet_page(connection, status.Wanted(), "id", 10) == []
+        assert status.fleet_page(connection, status.StatusFilter(), "id", 10) == []
     told = backfill(plan, HereTasks(), 2, shown)
     assert told.done_before == 3
     alone = replayed(engine, place, tmp_path)
@@ -174,7 +174,7 @@ def test_a_vehicle_of_which_work_was_lost_stays_as_it_was_until_the_next_time(
     told = backfill(plan, Losing(), 2, shown)
     assert told.swapped == 1 and any("a-north-2.mcap: its process ended" in one for one in told.problems)
     with any_store.read() as connection:
-        assert [row.id for row in status.fleet_page(connection, status.Wanted(), "id", 10)] == ["north-1"]
+        assert [row.id for row in status.fleet_page(connection, status.StatusFilter(), "id", 10)] == ["north-1"]
 
 
 def test_a_copy_of_a_recording_adds_nothing_and_is_reported(plan: BackfillPlan, place: Path, any_store: Store) -> None:

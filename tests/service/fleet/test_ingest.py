@@ -18,7 +18,7 @@ from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.store import Store, open_store
-from sprung.service.store.status import Wanted, fleet_page
+from sprung.service.store.status import StatusFilter, fleet_page
 from sprung.service.store.windows import known_windows
 from sprung.service.times import NANOSECONDS
 from tests.service_fakes import HOP, START, make_window
@@ -110,7 +110,7 @@ def test_many_vehicles_are_folded_with_the_statements_of_one(
     expected = alone(engine, tmp_path_factory, one)
     assert all(pipeline.state(name).to_dict() == expected for name in names)
     with pipeline.store.read() as connection:
-        lines = {row.id: row.windows for row in fleet_page(connection, Wanted(), "id", 50)}
+        lines = {row.id: row.windows for row in fleet_page(connection, StatusFilter(), "id", 50)}
     assert lines.keys() == set(names) and all(sum(counted.values()) >= 24 for counted in lines.values())
 
 

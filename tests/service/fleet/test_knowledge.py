@@ -18,7 +18,7 @@ from sprung.service.fleet.knowledge import (
     worst,
 )
 from sprung.service.store import Store, fleet, history
-from sprung.service.store.circumstances import Ran, add_circumstances
+from sprung.service.store.circumstances import WindowCircumstances, add_circumstances
 from sprung.service.store.levels import FleetLevels, fleet_levels
 from sprung.service.store.windows import VehicleWindows, add_windows
 from tests.service.store.test_store import DAY, HOP, START, record
@@ -146,7 +146,7 @@ def test_levels_of_a_fleet_are_read_from_hours(any_store: Store) -> None:
             stored = [VehicleWindows(vehicle, model, rows)]
             add_windows(connection, stored, START, None)
             history.add_to_rollups(connection, stored, START)
-            ran = [Ran(row.start, {"temperature": 5.0 + v}) for row in rows] if v else []
+            ran = [WindowCircumstances(row.start, {"temperature": 5.0 + v}) for row in rows] if v else []
             add_circumstances(connection, {vehicle: ran}, START)
     with any_store.read() as connection:
         found = fleet_levels(connection, model, START // DAY * DAY, START // DAY * DAY + 5 * DAY, 5)

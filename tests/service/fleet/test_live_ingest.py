@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from sprung.model.system import System
 from sprung.service.api.live_ingest import ingest_app
 from sprung.service.errors import Busy
-from sprung.service.fleet.ingest import Ingest, Taken, read_messages
+from sprung.service.fleet.ingest import Ingest, IngestResult, read_messages
 from sprung.service.fleet.message import MEDIA_TYPE, Message, SentWindows, WindowEstimate, encode
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
@@ -30,12 +30,12 @@ class AtOnce:
         self.ingest = Ingest(pipeline, 0.0)
         self.busy = False
 
-    async def fold(self, body: bytes) -> Taken:
+    async def fold(self, body: bytes) -> IngestResult:
         if self.busy:
             raise Busy("too many requests wait; try again in a second")
         return (await asyncio.to_thread(self.ingest.take, read_messages([body])))[0]
 
-    async def identify_and_fold(self, sent: SentWindows) -> Taken:
+    async def identify_and_fold(self, sent: SentWindows) -> IngestResult:
         found = self.engine.identify(sent.values, starts=sent.starts)[0]
         windows = [WindowEstimate(s, "used", None, 0, False, e) for s, e in zip(sent.starts, found, strict=True)]
         return await self.fold(encode(Message(sent.vehicle, self.engine.digest, tuple(windows)), "exact"))

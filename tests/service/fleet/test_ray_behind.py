@@ -10,7 +10,7 @@ import pytest
 
 from sprung.service.api.ray_serving import RayBehind, ServingSizes
 from sprung.service.errors import Busy, UserError
-from sprung.service.fleet.ingest import Taken
+from sprung.service.fleet.ingest import IngestResult
 from sprung.service.fleet.message import Message, SentWindows
 
 pytest.importorskip("ray")
@@ -60,8 +60,12 @@ def window(vehicle: str, start: int, count: int = 1) -> SentWindows:
     return SentWindows(vehicle, [start + i for i in range(count)], np.zeros((count, 2, 3)))
 
 
-def taken(message: Message) -> Taken | UserError:
-    return UserError("not this one") if message.vehicle == "v-3" else Taken(message.vehicle, len(message.windows), 0, 0)
+def taken(message: Message) -> IngestResult | UserError:
+    return (
+        UserError("not this one")
+        if message.vehicle == "v-3"
+        else IngestResult(message.vehicle, len(message.windows), 0, 0)
+    )
 
 
 def behind(**sizes: Any) -> tuple[RayBehind, Remote, Remote]:

@@ -23,7 +23,7 @@ from sprung.service.core import Core, build_core
 from sprung.service.errors import Busy
 from sprung.service.monitoring.batching import AnsweredWindow, AskedWindow
 from sprung.service.monitoring.engine import Engine
-from sprung.service.monitoring.processed import Folded, ToFold
+from sprung.service.monitoring.processed import FoldedWindows, WindowsToFold
 from sprung.service.settings import Settings
 from sprung.service.store.windows import known_starts
 from sprung.service.times import NANOSECONDS
@@ -256,7 +256,9 @@ def test_a_vehicle_that_cannot_be_tracked_costs_only_itself(
 ) -> None:
     real = running.pipeline.fold_all
 
-    def failing(connection: Connection, asked: Sequence[ToFold], recording_id: str | None = None) -> list[Folded]:
+    def failing(
+        connection: Connection, asked: Sequence[WindowsToFold], recording_id: str | None = None
+    ) -> list[FoldedWindows]:
         if any(one.vehicle == "sick" for one in asked):
             raise FloatingPointError("no posterior")
         return real(connection, asked, recording_id)

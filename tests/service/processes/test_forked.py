@@ -26,7 +26,7 @@ from sprung.service.monitoring.engine import Engine, one_thread_an_operation
 from sprung.service.monitoring.following import FollowingApart, follow
 from sprung.service.monitoring.identifying import IdentifierApart
 from sprung.service.monitoring.pipeline import Pipeline
-from sprung.service.monitoring.processed import ToFold
+from sprung.service.monitoring.processed import WindowsToFold
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
 from sprung.service.store import Store, open_store
 from tests.service_fakes import make_window
@@ -224,8 +224,8 @@ def test_a_vehicle_that_fails_leaves_the_others_as_they_were(engine: Engine, sys
         with store.write() as connection:
             at = pipeline.hold_all(connection, ["a"])["a"]
         (estimate,), _ = engine.identify(windows[3].values[None])
-        told = ToFold("a", windows[3:4], [estimate], at)
-        wrong = ToFold(
+        told = WindowsToFold("a", windows[3:4], [estimate], at)
+        wrong = WindowsToFold(
             "b",
             windows[:1],
             [replace(estimate, log_ratio=np.zeros(1))],

@@ -22,7 +22,7 @@ from sprung.service.store import Store, fleet, history, open_store, partitions, 
 from sprung.service.store.schema import metadata, windows
 from sprung.service.store.windows import (
     Posterior,
-    Solved,
+    StoredEstimate,
     VehicleWindows,
     WindowLoads,
     WindowRecord,
@@ -39,7 +39,7 @@ DAY = 86_400 * NANOSECONDS
 
 def record(number: int, level: float | None = None) -> WindowRecord:
     mean = np.full(P, 0.001 * number if level is None else level)
-    solved = Solved(
+    solved = StoredEstimate(
         mean, np.full(P, 0.1), np.array([True, False, True]), 0.03, np.array([0.02, np.nan]), 1.1, True, True, 2
     )
     return WindowRecord(START + number * HOP, "used", None, 0, True, solved, Posterior(mean, np.full(P, 0.01)))
@@ -93,7 +93,7 @@ def test_vehicles_that_an_earlier_version_called_well_unheard_are_not_called_so_
     store.close()
     store = open_store(str(path))
     with store.read() as connection:
-        health = {row.id: row.health for row in status.fleet_page(connection, status.Wanted(), "id", 9)}
+        health = {row.id: row.health for row in status.fleet_page(connection, status.StatusFilter(), "id", 9)}
     store.close()
     assert (health["unheard"], health["heard"]) == ("check_function", "ok")
 
