@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from sprung.model.exchange.equations import EquationSite, identifier, linear, output, sites, total
@@ -60,60 +62,99 @@ def _block(site: EquationSite, index: int) -> list[str]:
     return [*lines, f"  end {name};", ""]
 
 
+@dataclass(frozen=True)
+class _ModelicaNames:
+    """Identifiers of a vehicle's variables."""
+
+    dofs: list[str]
+    elements: list[str]
+    drives: list[str]  # inputs, in the order of the mechanics
+
+    @classmethod
+    def of(cls, system: System) -> _ModelicaNames:
+        drives = [
+            f"{identifier(name)}_{quantity}"
+            for name, source in system.file.inputs.items()
+            for quantity in (["force"] if source.kind == "force" else ["displacement", "velocity"])
+        ]
+        dofs = [identifier(dof) for dof in system.mechanics.dofs]
+        return cls(dofs, [identifier(element) for element in system.all_elements], drives)
+
+
 def _vehicle(system: System, laws: list[EquationSite]) -> list[str]:
+    names = _ModelicaNames.of(system)
+    return [
+        "  model Vehicle",
+        *_declarations(system, laws, names),
+        "  equation",
+        *[f"    der({dof}) = {dof}_rate;" for dof in names.dofs],
+        *_element_equations(system, laws, names),
+        *_law_equations(laws, names),
+        *_motion_equations(system, names),
+        *_sensor_equations(system, names),
+        "  end Vehicle;",
+        "",
+    ]
+
+
+def _declarations(system: System, laws: list[EquationSite], names: _ModelicaNames) -> Iterator[str]:
     m = system.mechanics
-    dofs = [identifier(dof) for dof in m.dofs]
-    names = [identifier(element) for element in system.all_elements]
-    lines = ["  model Vehicle"]
-    for e, name in enumerate(names):
-        lines.append(f'    parameter Real {name}_stiffness = {float(m.stiffness[e])!r} "N/m";')
-        lines.append(f'    parameter Real {name}_damping = {float(m.damping[e])!r} "N.s/m";')
-    drives: dict[int, str] = {}
-    at = 0
-    for source_name, source in system.file.inputs.items():
-        quantities = ["force"] if source.kind == "force" else ["displacement", "velocity"]
-        for quantity in quantities:
-            drives[at] = f"{identifier(source_name)}_{quantity}"
-            lines.append(f"    input Real {drives[at]};")
-            at += 1
-    lines += [f"    output Real {identifier(sensor)};" for sensor in system.sensors]
-    for dof in dofs:
-        lines.append(f"    Real {dof}(start = 0.0, fixed = true);")
-        lines.append(f"    Real {dof}_rate(start = 0.0, fixed = true);")
-    lines += [f"    Real d_{name}, v_{name}, f_{name};" for name in names]
-    lines += [f"    {_name(site, index)} law_{index};" for index, site in enumerate(laws)]
-    lines.append("  equation")
-    lines += [f"    der({dof}) = {dof}_rate;" for dof in dofs]
-    value, slope = ([drives[int(i) + part] for i in m.support_drive] for part in (0, 1))
-    rates = [f"{dof}_rate" for dof in dofs]
-    for e, name in enumerate(names):
-        for motion, above, below in (("d", dofs, value), ("v", rates, slope)):
+    for e, name in enumerate(names.elements):
+        yield f'    parameter Real {name}_stiffness = {float(m.stiffness[e])!r} "N/m";'
+        yield f'    parameter Real {name}_damping = {float(m.damping[e])!r} "N.s/m";'
+    for drive in names.drives:
+        yield f"    input Real {drive};"
+    for sensor in system.sensors:
+        yield f"    output Real {identifier(sensor)};"
+    for dof in names.dofs:
+        yield f"    Real {dof}(start = 0.0, fixed = true);"
+        yield f"    Real {dof}_rate(start = 0.0, fixed = true);"
+    for name in names.elements:
+        yield f"    Real d_{name}, v_{name}, f_{name};"
+    for index, site in enumerate(laws):
+        yield f"    {_name(site, index)} law_{index};"
+
+
+def _element_equations(system: System, laws: list[EquationSite], names: _ModelicaNames) -> Iterator[str]:
+    """Deflections, rates and forces."""
+    m = system.mechanics
+    value, slope = ([names.drives[int(i) + part] for i in m.support_drive] for part in (0, 1))
+    rates = [f"{dof}_rate" for dof in names.dofs]
+    for e, name in enumerate(names.elements):
+        for motion, above, below in (("d", names.dofs, value), ("v", rates, slope)):
             found = total(linear(m.H[e], above.__getitem__), linear(m.G[e], below.__getitem__))
-            lines.append(f"    {motion}_{name} = {found};")
+            yield f"    {motion}_{name} = {found};"
         own = f"{name}_stiffness * d_{name} + {name}_damping * v_{name}"
         added = [f"{float(s.weights[e])!r} * law_{i}.f" for i, s in enumerate(laws) if s.weights[e]]
-        lines.append(f"    f_{name} = {total(own, *added)};")
+        yield f"    f_{name} = {total(own, *added)};"
+
+
+def _law_equations(laws: list[EquationSite], names: _ModelicaNames) -> Iterator[str]:
     for i, site in enumerate(laws):
-        element = names[site.element]
-        lines += [
-            f"    law_{i}.d = {linear(site.weights, lambda e: f'd_{names[e]}')};",
-            f"    law_{i}.v = {linear(site.weights, lambda e: f'v_{names[e]}')};",
-            f"    law_{i}.k = {element}_stiffness;",
-            f"    law_{i}.c = {element}_damping;",
-        ]
-    for i, dof in enumerate(dofs):
-        pull = linear(-m.H[:, i], lambda e: f"f_{names[e]}")
-        push = linear(m.F[i], lambda j: drives[int(m.force_drive[j])])
-        lines.append(f"    {float(m.mass[i])!r} * der({dof}_rate) = {total(pull, push)};")
+        element = names.elements[site.element]
+        yield f"    law_{i}.d = {linear(site.weights, lambda e: f'd_{names.elements[e]}')};"
+        yield f"    law_{i}.v = {linear(site.weights, lambda e: f'v_{names.elements[e]}')};"
+        yield f"    law_{i}.k = {element}_stiffness;"
+        yield f"    law_{i}.c = {element}_damping;"
+
+
+def _motion_equations(system: System, names: _ModelicaNames) -> Iterator[str]:
+    m = system.mechanics
+    for i, dof in enumerate(names.dofs):
+        pull = linear(-m.H[:, i], lambda e: f"f_{names.elements[e]}")
+        push = linear(m.F[i], lambda j: names.drives[int(m.force_drive[j])])
+        yield f"    {float(m.mass[i])!r} * der({dof}_rate) = {total(pull, push)};"
+
+
+def _sensor_equations(system: System, names: _ModelicaNames) -> Iterator[str]:
     for s, sensor in enumerate(system.sensors):
         shown = output(
             system,
             s,
-            dofs.__getitem__,
-            rates.__getitem__,
-            lambda i: f"der({rates[i]})",
-            lambda e: f"d_{names[e]}",
-            lambda e: f"f_{names[e]}",
+            names.dofs.__getitem__,
+            lambda i: f"{names.dofs[i]}_rate",
+            lambda i: f"der({names.dofs[i]}_rate)",
+            lambda e: f"d_{names.elements[e]}",
+            lambda e: f"f_{names.elements[e]}",
         )
-        lines.append(f"    {identifier(sensor)} = {shown};")
-    return [*lines, "  end Vehicle;", ""]
+        yield f"    {identifier(sensor)} = {shown};"

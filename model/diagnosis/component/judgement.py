@@ -93,6 +93,6 @@ def _speaks(one: JudgedComponent) -> Iterator[tuple[EffectKind, float]]:
         yield kind_of(SIGN_REVERSED), -np.inf
     given = len(one.record.given.pieces)
     for part, step in zip(one.final.model.pieces[given:], one.found.steps if one.named else (), strict=False):
-        yield part.speaks_for, step.delta_bic
+        yield part.effect_kind, step.delta_bic
     if one.unnamed is not None:
         yield EffectKind.UNLISTED, one.unnamed.delta_bic

@@ -125,7 +125,7 @@ class Piece:
         return self.law.name
 
     @property
-    def speaks_for(self) -> EffectKind:
+    def effect_kind(self) -> EffectKind:
         """The kind of finding that it is."""
         return kind_of(self.law)
 
@@ -174,8 +174,8 @@ class Following:
         return self.piece.effect
 
     @property
-    def speaks_for(self) -> EffectKind:
-        return self.piece.speaks_for
+    def effect_kind(self) -> EffectKind:
+        return self.piece.effect_kind
 
     @property
     def title(self) -> str:
@@ -246,7 +246,7 @@ class SliderSurface:
     """A smooth force over deflection and rate, and a family of sliders (Prandtl and Ishlinskii) for its memory."""
 
     effect: str = UNKNOWN
-    speaks_for: EffectKind = EffectKind.UNLISTED
+    effect_kind: EffectKind = EffectKind.UNLISTED
     title: str = "a force that no law explains"
     key: str = UNKNOWN
     kind: PieceKind = STATIC
@@ -287,7 +287,7 @@ class Lag:
 
     filters: bool = False  # whether its time is the time constant of a filter
     effect: str = SENSOR_LAG.name
-    speaks_for: EffectKind = EffectKind.FAULT
+    effect_kind: EffectKind = EffectKind.FAULT
     title: str = SENSOR_LAG.title
     kind: PieceKind = STATIC
     dissipates: bool = False

@@ -26,6 +26,14 @@ _FEWEST = 5  # samples for a force
 _NEAR_RATE = 0.05  # relative distance of a sample's rate
 _BAND = 0.8  # of the residual's power, for its main band
 
+_SPOKEN = frozenset(
+    {"yield_force", "yield_displacement", "slip_force", "lost_motion", "breakaway_force", "force_at_knee"}
+)
+_TO_DISTINGUISH = (
+    "a test at other amplitudes and other rates, so that the same deflections come at other rates, "
+    "would tell them apart"
+)
+
 
 def finding_of(
     element: str,
@@ -44,30 +52,23 @@ def finding_of(
     quoted += _forces_at_rates(fit)
     family = _family(piece.effect, alike)
     rival = step.rivals[0] if step.rivals else None
-    shown = [q for q in quoted if q.name in _SPOKEN] or list(values[:2])
-    main = ", ".join(f"{q.name.replace('_', ' ')} {q.words()}" for q in shown[:3])
     formula, memory = (piece.law.formula, piece.law.memory_formula) if isinstance(piece, FormulaPiece) else ("", "")
-    sentence = f"{element}: {f'a force {formula}' if formula else piece.title}, {main}"
-    if memory:
-        sentence += f", z' = {memory}"
-    if family is not None:
-        sentence += f" ({family.replace('_', ' ')} fit almost equally well)"
+    what = f"a force {formula}" if formula else piece.title
+    shown = [one for one in quoted if one.name in _SPOKEN] or list(values[:2])
+    sentence = _sentence(f"{element}: {what}", shown[:3], memory, family)
     if base.element.damping > 0 and fit.element.damping * fit.task.rules.no_longer < base.element.damping:
         sentence += f"; {element}.damping is then no longer needed"
     return Finding(
         location=element,
         effect=piece.effect,
-        kind=piece.speaks_for,
+        kind=piece.effect_kind,
         parameters=values,
         p_value=step.p_value,
         delta_bic=step.delta_bic,
         runner_up=None if rival is None else (rival.last.effect, step.rival_bic(rival)),
         runner_up_location=None if rival is None else element,
         family=family,
-        advice=None
-        if family is None
-        else "a test at other amplitudes and other rates, so that the same deflections come at other rates, "
-        "would tell them apart",
+        advice=None if family is None else _TO_DISTINGUISH,
         sentence=sentence,
         quoted=quoted,
         formula=formula,
@@ -75,9 +76,13 @@ def finding_of(
     )
 
 
-_SPOKEN = frozenset(
-    {"yield_force", "yield_displacement", "slip_force", "lost_motion", "breakaway_force", "force_at_knee"}
-)
+def _sentence(what: str, values: Sequence[LawParameter], memory: str, family: str | None) -> str:
+    """A law with its main values, and what fits as well."""
+    named = ", ".join(f"{one.name.replace('_', ' ')} {one.words()}" for one in values)
+    words = f"{what}, {named}"
+    if memory:
+        words += f", z' = {memory}"
+    return words if family is None else f"{words} ({family.replace('_', ' ')} fit almost equally well)"
 
 
 def _parameters(values: Values, sigma: FloatArray) -> tuple[LawParameter, ...]:
