@@ -137,11 +137,22 @@ def engine_like(engine: Engine, system: System) -> Engine:
 
     Raises the model's one-line ValueErrors for a system whose windows cannot be identified.
     """
+    identifier = own_identifier(system)
+    apart = getattr(engine.identifier, "of_own_model", None)  # where the service identifies in processes of their own
+    if apart is not None:
+        identifier = apart(system, identifier)
+    return replace(engine, system=system, identifier=identifier, tracker=make_tracker(system))
+
+
+def own_identifier(system: System) -> Identifies:
+    """The identifier of a vehicle's own system file.
+
+    Raises the model's one-line ValueErrors for a system whose windows cannot be identified.
+    """
     from sprung.model.identification.identify import load_identifier  # brings torch
 
     # one worker: the other processors are for vehicles without such a file
-    identifier = load_identifier(system, seconds=OWN_SECONDS)
-    return replace(engine, system=system, identifier=identifier, tracker=make_tracker(system))
+    return load_identifier(system, seconds=OWN_SECONDS)
 
 
 def seconds_of_a_window(engine: Engine) -> float:
@@ -152,8 +163,9 @@ def seconds_of_a_window(engine: Engine) -> float:
     if system.on_track or not system.file.inputs:
         return 0.0
     runs = simulate_runs(system, np.zeros((1, len(system.parameters))), system.window, np.random.default_rng(0))
+    here = getattr(engine.identifier, "here", engine.identifier)  # processor time of this thread is what is measured
     begin = time.thread_time()
-    engine.identify(runs.values, starts=[0])
+    replace(engine, identifier=here).identify(runs.values, starts=[0])
     return time.thread_time() - begin
 
 

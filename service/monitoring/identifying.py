@@ -1,27 +1,35 @@
-"""Identifying in a process of its own, see `service.processes.forked`."""
+"""Identifying in processes of their own, see `service.processes.forked`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 from sprung.model.identifier import Identifies, StageTimes
+from sprung.model.laws import Law
+from sprung.model.schema import SystemFile
 from sprung.model.signals import Estimate, FloatArray
-from sprung.service.monitoring.engine import one_thread_an_operation
+from sprung.model.system import System
+from sprung.service.monitoring.engine import one_thread_an_operation, own_identifier
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
+
+KEPT = 16  # identifiers of single vehicles in their process
+NICE = 10  # of that process: where processors are scarce, the windows of all other vehicles come first
 
 
 class IdentifierApart:
     """An identifier in a process of its own; in this one from when that has ended."""
 
-    def __init__(self, identifier: Identifies) -> None:
-        self.digest = identifier.digest
+    def __init__(self, here: Identifies, ask: Callable[..., Any], own_models: ForkedFunctions | None = None) -> None:
+        """ask: as `_asked`, in the process; own_models: the process for vehicles with models of their own."""
+        self.digest = here.digest
         self.times = StageTimes()
-        self._here = identifier
-        self.forked = ForkedFunctions(
-            "identifies windows", {"ask": partial(_asked, identifier)}, one_thread_an_operation
-        )
+        self.here = here
+        self._ask_there = ask
+        self._own_models = own_models
 
     def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
         """As that of the identifier."""
@@ -30,14 +38,53 @@ class IdentifierApart:
     @property
     def examine(self) -> Callable[..., list[Estimate]] | None:
         """That of the identifier, where it has one."""
-        return partial(self._ask, "examine") if hasattr(self._here, "examine") else None
+        return partial(self._ask, "examine") if hasattr(self.here, "examine") else None
+
+    def of_own_model(self, system: System, here: Identifies) -> Identifies:
+        """That of a vehicle's own model, apart as well: its windows may take seconds each."""
+        if self._own_models is None:
+            return here
+        return IdentifierApart(here, partial(self._own_models.call, "ask", here.digest, system.file))
 
     def _ask(self, what: str, *given: Any, **named: Any) -> list[Estimate]:
         try:
-            found, self.times = self.forked.call("ask", what, *given, **named)
+            found, self.times = self._ask_there(what, *given, **named)
         except ProcessEnded:
-            found, self.times = _asked(self._here, what, *given, **named)
+            found, self.times = _asked(self.here, what, *given, **named)
         return list(found)
+
+
+def identifying_processes(identifier: Identifies, catalogue: Sequence[Law]) -> tuple[ForkedFunctions, ForkedFunctions]:
+    """Two processes: for windows of vehicles with the service's system file, and for those of vehicles with their own.
+
+    catalogue: of laws, by which system files are read.
+    """
+    shared, own = {"ask": partial(_asked, identifier)}, {"ask": _OwnIdentifiers(catalogue).ask}
+    return (
+        ForkedFunctions("identifies windows", shared, one_thread_an_operation),
+        ForkedFunctions("identifies windows with vehicles' own models", own, _begin_behind),
+    )
+
+
+def _begin_behind() -> None:
+    one_thread_an_operation()
+    os.nice(NICE)
+
+
+class _OwnIdentifiers:
+    """The last ones that were asked for, in the process for vehicles with models of their own."""
+
+    def __init__(self, catalogue: Sequence[Law]) -> None:
+        self._catalogue = tuple(catalogue)
+        self._held: OrderedDict[str, Identifies] = OrderedDict()
+
+    def ask(self, digest: str, file: SystemFile, what: str, *given: Any, **named: Any) -> tuple[Any, StageTimes]:
+        """As `_asked`, of the identifier of a system file."""
+        identifier = self._held.pop(digest, None) or own_identifier(System(file, self._catalogue))
+        self._held[digest] = identifier
+        if len(self._held) > KEPT:
+            self._held.popitem(last=False)
+        return _asked(identifier, what, *given, **named)
 
 
 def _asked(identifier: Identifies, what: str, *given: Any, **named: Any) -> tuple[list[Estimate], StageTimes]:

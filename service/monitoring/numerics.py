@@ -1,14 +1,15 @@
-"""Identifying and tracking, each in a process of its own beside what reads, answers and stores."""
+"""Identifying, with vehicles' own models apart, and tracking, each in a process beside what answers and stores."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.following import Following, FollowingApart, follow
-from sprung.service.monitoring.identifying import IdentifierApart
+from sprung.service.monitoring.identifying import IdentifierApart, identifying_processes
 from sprung.service.processes.forked import forks
 from sprung.service.settings import Settings
 
@@ -19,7 +20,7 @@ def numerics(engine: Engine, settings: Settings) -> Iterator[tuple[Engine, Follo
 
     Enter it before the first thread is started.  In one interpreter the two and the API would take turns: measured with
     100 vehicles and a window a second on two cores, each took twice the processor time that it takes alone, and
-    windows came to wait 26 s.
+    windows came to wait 26 s.  Windows of a vehicle with a model of its own may take seconds of it each.
     """
     if not (settings.apart and forks()):
         yield engine, follow
@@ -27,6 +28,8 @@ def numerics(engine: Engine, settings: Settings) -> Iterator[tuple[Engine, Follo
     with ExitStack() as stack:
         following = FollowingApart(engine, settings.vehicles_in_memory)
         stack.callback(following.forked.close)
-        identifier = IdentifierApart(engine.identifier)
-        stack.callback(identifier.forked.close)
+        shared, own = identifying_processes(engine.identifier, engine.system.catalogue)
+        stack.callback(shared.close)
+        stack.callback(own.close)
+        identifier = IdentifierApart(engine.identifier, partial(shared.call, "ask"), own)
         yield replace(engine, identifier=identifier), following

@@ -135,9 +135,10 @@ class Notices:
 def receivers(settings: Settings) -> tuple[str, ...]:
     """Webhooks, then mail addresses as mailto:.  Raises UserError for one that cannot be."""
     found = []
+    allowed = outside.networks(settings.webhook_networks)
     for url in settings.webhooks.replace(",", " ").split():
         try:
-            _plainly_allowed(outside.safe_url(url).host, outside.networks(settings.webhook_networks))
+            _plainly_allowed(outside.safe_url(url).host, allowed)
         except ValueError as error:
             raise UserError(f"setting webhooks (SPRUNG_WEBHOOKS): {error}") from None
         found.append(url)

@@ -122,7 +122,7 @@ def test_receivers_on_this_host_need_a_word_in_the_settings(tmp_path: Path, stor
     with pytest.raises(UserError, match="SPRUNG_WEBHOOK_NETWORKS"):
         Notices(Settings(**settings), store)
     Notices(Settings(**settings, webhook_networks="127.0.0.0/8"), store)
-    with pytest.raises(UserError, match="SPRUNG_WEBHOOK_NETWORKS"):
+    with pytest.raises(UserError, match=r"^setting webhook_networks \(SPRUNG_WEBHOOK_NETWORKS\): "):
         Notices(Settings(**settings, webhook_networks="127.0.0.1/8"), store)
 
 

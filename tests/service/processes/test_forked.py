@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,13 @@ import numpy as np
 import pytest
 import torch
 
+from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identifier import UnusableWindow
-from sprung.model.system import System
+from sprung.model.system import MANCHESTER, System, parse_system
 from sprung.service.monitoring.compute import Compute
-from sprung.service.monitoring.engine import Engine, one_thread_an_operation
+from sprung.service.monitoring.engine import Engine, engine_like, one_thread_an_operation, seconds_of_a_window
 from sprung.service.monitoring.following import FollowingApart, follow
-from sprung.service.monitoring.identifying import IdentifierApart
+from sprung.service.monitoring.identifying import IdentifierApart, identifying_processes
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import WindowsToFold
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
@@ -167,9 +169,10 @@ def test_calls_of_several_threads_get_their_own_answers(doubling: ForkedFunction
 
 
 def test_an_identifier_apart_answers_as_it_does_here(engine: Engine, system: System) -> None:
-    apart = IdentifierApart(engine.identifier)
+    shared, own = identifying_processes(engine.identifier, system.catalogue)
+    apart = IdentifierApart(engine.identifier, partial(shared.call, "ask"), own)
     values = np.stack([make_window(system, n).values for n in range(3)])
-    with closing(apart.forked):
+    with closing(shared), closing(own):
         there = replace(engine, identifier=apart)
         assert there.digest == engine.digest
         here, _ = engine.identify(values)
@@ -178,9 +181,30 @@ def test_an_identifier_apart_answers_as_it_does_here(engine: Engine, system: Sys
             for one, other in zip(here, found, strict=True):
                 np.testing.assert_array_equal(one.log_ratio, other.log_ratio)
                 np.testing.assert_array_equal(one.covariance, other.covariance)
-            if apart.forked.pid is not None:
-                os.kill(apart.forked.pid, signal.SIGKILL)
+            if shared.pid is not None:
+                os.kill(shared.pid, signal.SIGKILL)
         assert (apart.examine is None) == (not hasattr(engine.identifier, "examine"))
+
+
+def test_a_vehicles_own_model_is_identified_apart_and_behind_the_others(engine: Engine, system: System) -> None:
+    shared, own = identifying_processes(engine.identifier, system.catalogue)
+    with closing(shared), closing(own):
+        served = replace(engine, identifier=IdentifierApart(engine.identifier, partial(shared.call, "ask"), own))
+        other = parse_system(MANCHESTER.read_text().replace("mass: 32000", "mass: 33000"))
+        there, here = engine_like(served, other), engine_like(engine, other)
+        assert isinstance(there.identifier, IdentifierApart) and there.digest == here.digest != engine.digest
+        assert shared.pid is not None and own.pid is not None
+        assert os.getpriority(os.PRIO_PROCESS, own.pid) > os.getpriority(os.PRIO_PROCESS, shared.pid)
+        os.kill(shared.pid, signal.SIGKILL)  # not needed for it
+        runs = simulate_runs(other, np.zeros((2, len(other.parameters))), other.window, np.random.default_rng(1))
+        begun = time.thread_time()
+        found, _ = there.identify(runs.values)
+        taken = time.thread_time() - begun
+        wanted, _ = here.identify(runs.values)
+        for one, another in zip(wanted, found, strict=True):
+            np.testing.assert_array_equal(one.log_ratio, another.log_ratio)
+        assert taken < time.thread_time() - begun - taken
+        assert seconds_of_a_window(there) > 0.0  # measured here, where processor time can be
 
 
 @pytest.mark.parametrize("vehicles", [1, 10])
