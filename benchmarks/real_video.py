@@ -76,7 +76,7 @@ def run(data: Path | None = None, *, frame_rate: float = 60.0, system: str | Non
         frames = video.frames()
         row |= {"frames": len(frames), "truth": video.truth}
         if "pendulum" in video.system:
-            row |= _told(pendulum_length(frames, frame_rate), video.truth)
+            row |= _figures_of(pendulum_length(frames, frame_rate), video.truth)
         yield row
 
 
@@ -199,7 +199,7 @@ def _swing(frames: FloatArray) -> FloatArray | None:
     return np.asarray(centre @ directions[0])
 
 
-def _told(fit: SwingFit | None, truth: dict[str, float]) -> dict[str, Any]:
+def _figures_of(fit: SwingFit | None, truth: dict[str, float]) -> dict[str, Any]:
     if fit is None:
         return {"length": None, "why": "nothing swings"}
     true = next((value for name, value in truth.items() if "length" in name), None)

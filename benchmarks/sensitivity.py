@@ -133,7 +133,7 @@ def run(
         if number % parts != own - 1 or (names and not any(one in name for one in names)):
             continue
         file = None if folder is None else folder / f"{name.replace(' ', '-')}.json"
-        known = _told(name, make, keys, file, settings)
+        known = _varied_on(name, make, keys, file, settings)
         done.append(known)
         changed = {key: one["changed"] for key, one in known["varied"].items() if one and one["changed"]}
         yield {key: known[key] for key in ("recording", "verdict", "findings")} | {"changed": changed}
@@ -150,7 +150,7 @@ def run(
     }
 
 
-def _told(
+def _varied_on(
     name: str,
     make: Callable[[], Made],
     keys: list[tuple[str, Field[Any]]],

@@ -2,7 +2,7 @@
 
 Laws strong, and weak enough that a report says so; faults of sensors and of inputs; wrong set-ups; healthy ones.
 Some are there for what only they have: a high sampling rate, a force of no law, a part that the file lacks, a shaker
-whose sensors are exchanged.
+whose sensors are exchanged, a car of which accelerations alone are measured.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import yaml
 from scipy.linalg import expm
 from scipy.signal import decimate
 
+from sprung.benchmarks.cars import EFFECTS, HUBS, recorded
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
 from sprung.benchmarks.setups import FalsifiedRecording, falsified, in_order
 from sprung.model.signals import FloatArray
@@ -186,10 +187,18 @@ def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[t
     for name, imperfect in IMPERFECT.items():
         yield f"rig {name}", partial(_made, RIG, partial(rig, imperfect=imperfect), seed + 2, seconds)
     yield "shaken, exchanged", partial(_made, SHAKEN, shaken, seed + 3)
+    yield "accelerations", partial(_on_hubs, seed + 4)
 
 
 def _made(text: str, make: Callable[..., FalsifiedRecording], seed: int, *more: float) -> Made:
     return parse_system(text), make(np.random.default_rng(seed), *more)
+
+
+def _on_hubs(seed: int) -> Made:
+    """A car of which accelerations alone are measured, with a damper that is harder in extension."""
+    effect = next(one for one in EFFECTS if (one.file, one.law) == (HUBS, "damper_asymmetry"))
+    system, values = recorded(effect, np.random.default_rng(seed))
+    return system, FalsifiedRecording("", frozenset(), values, sample_rate=system.sample_rate)
 
 
 def _known(system: System, record: FalsifiedRecording) -> Made:

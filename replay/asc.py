@@ -14,7 +14,7 @@ from can.io.asc import ASCReader
 
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.frames import FrameBlock
-from sprung.replay.textframes import LineFrames, decimal_ns, frame_id, in_time, integer, line_batches, told_cut
+from sprung.replay.textframes import LineFrames, decimal_ns, frame_id, in_time, integer, line_batches, note_cut_frames
 
 DATE = re.compile(rb"(?:date|Begin Trigger ?block)\s+\w+\s+(?P<date>.+)", re.IGNORECASE)
 BASE = re.compile(rb"base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<stamps>absolute|relative))?", re.IGNORECASE)
@@ -71,7 +71,7 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
                 account.foreign(1, frame)
         if not recognised and not batch.time:
             raise UnreadableRecording(f"{path}: no Vector ASC log (neither a header nor a frame was found)")
-        told_cut(lines, account)
+        note_cut_frames(lines, account)
         if damaged:
             account.corrupt(damaged, "line cannot be read")
             account.problem(f"{damaged} frames near {clock / 1e9:.3f} s cannot be read")

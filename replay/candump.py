@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.frames import FrameBlock
-from sprung.replay.textframes import LineFrames, decimal_ns, frame_id, integer, line_batches, told_cut
+from sprung.replay.textframes import LineFrames, decimal_ns, frame_id, integer, line_batches, note_cut_frames
 
 ERROR_FLAG = 0x2000_0000
 
@@ -37,7 +37,7 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         if damaged:
             account.corrupt(damaged, "line is no frame")
             account.problem(f"{damaged} lines near {_near(batch)} are no frames")
-        told_cut(lines, account)
+        note_cut_frames(lines, account)
         if batch.time:
             yield batch.block(account)
 

@@ -139,7 +139,7 @@ class PlausibilityCheck:
             counts += np.bincount(channel, minlength=len(counts))
             self._first.setdefault(kind, int(time.min()))
 
-    def _told(self, kind: str, counts: IntArray, least: int, what: str) -> None:
+    def _note(self, kind: str, counts: IntArray, least: int, what: str) -> None:
         """One line on all channels that have at least so many."""
         found = np.flatnonzero(counts >= least)
         if len(found):
@@ -148,10 +148,10 @@ class PlausibilityCheck:
             after = (self._first[kind] - (self._begun or 0)) / 1e9
             self._account.note(f"{what}: {counts[found].sum()}, the first after {after:.2f} s ({names}{more})")
 
-    def tell(self) -> None:
+    def conclude(self) -> None:
         """At the end of the recording."""
-        self._told("twice", self._twice, 1, "samples that are there twice")
-        self._told("zero", self._zeros, FEWEST_ZEROS, "single values of 0 between others far from it")
+        self._note("twice", self._twice, 1, "samples that are there twice")
+        self._note("zero", self._zeros, FEWEST_ZEROS, "single values of 0 between others far from it")
         if self._late:
             self._account.problem(f"{self._late} samples left out: their time stamps are such as no clock shows")
         for index in np.flatnonzero(self._bad).tolist():

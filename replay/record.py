@@ -68,13 +68,13 @@ def load_record(
     start, values = _grid(longest, recording, sample_rate)
     missing = np.isnan(values)
     absent: BoolArray = np.asarray(missing.all(axis=0))
-    _tell_losses(recording, missing, absent, sample_rate)
+    _note_losses(recording, missing, absent, sample_rate)
     account = recording.account
     lost = int(missing[:, ~absent].sum())
     return Record(start, sample_rate, values, lost, account.vehicle, tuple(account.problems), account)
 
 
-def _tell_losses(recording: Recording, missing: BoolArray, absent: BoolArray, sample_rate: float) -> None:
+def _note_losses(recording: Recording, missing: BoolArray, absent: BoolArray, sample_rate: float) -> None:
     """Say of every channel that lacks much how much, and where its longest gap is."""
     for channel in np.flatnonzero((missing.mean(axis=0) > TELL_LOSS) & ~absent):
         edges = np.flatnonzero(np.diff(np.r_[False, missing[:, channel], False].astype(np.int8)))

@@ -98,7 +98,7 @@ class Recording:
                 if shift is None:
                     shift = self._shift(int(block.time.min()))
                 yield SampleBlock(block.time + shift, block.channel, block.value) if shift else block
-        self._plausibility.tell()
+        self._plausibility.conclude()
         if not self.seen[: len(self.seen) - self.beside].any():
             raise UnreadableRecording(self._nothing())
         if not self.seen.all():

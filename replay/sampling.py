@@ -94,7 +94,7 @@ def at_rate(
         yield from held
         yield from source
         return
-    _tell(reducers, channels, sample_rate, account)
+    _note_rates(reducers, channels, sample_rate, account)
     stage = _Stage(reducers)
     for block in held:
         yield from stage.push(block)
@@ -144,7 +144,9 @@ def _refuse_slow(
     )
 
 
-def _tell(reducers: dict[int, Reducer], channels: Sequence[Channel], sample_rate: float, account: Account) -> None:
+def _note_rates(
+    reducers: dict[int, Reducer], channels: Sequence[Channel], sample_rate: float, account: Account
+) -> None:
     by_rate: dict[str, list[str]] = {}
     for index, reducer in reducers.items():
         by_rate.setdefault(f"{1 / reducer.period:.4g}", []).append(channels[index].name)

@@ -71,7 +71,7 @@ def line_batches(path: Path) -> Iterator[list[bytes]]:
             yield [rest]
 
 
-def told_cut(lines: list[bytes], account: Account) -> None:
+def note_cut_frames(lines: list[bytes], account: Account) -> None:
     """Say that a file ends inside a line: every program that logs writes its lines with their ends."""
     if not lines[-1].endswith((b"\n", b"\r")):
         account.problem("the file ends inside a line: it was cut there, or its last line was")

@@ -85,7 +85,7 @@ class Operations:
             kept = marks.add_mark(connection, row)
             audit.record(connection, actor, "maintenance", vehicle, {"mark": kept.id, "parameters": learned}, now)
         if batch is not None:
-            self._pipeline.tell(batch)
+            self._pipeline.publish(batch)
         return kept
 
     def give_model(self, actor: str, vehicle: str, text: str, report: str | None) -> int:
@@ -109,7 +109,7 @@ class Operations:
                 version = vehicle_models.add_version(connection, vehicle, model, text, report, actor, now)
             engines.remember(vehicle, ServedModel(version, engine, model))
             batch = self._switch(connection, actor, vehicle, version, report, now)
-        self._pipeline.tell(batch)
+        self._pipeline.publish(batch)
         return version
 
     def use_model(self, actor: str, vehicle: str, version: int) -> None:
@@ -127,7 +127,7 @@ class Operations:
                 return
             self._pipeline.engines.version(connection, vehicle, version)
             batch = self._switch(connection, actor, vehicle, version, None, now)
-        self._pipeline.tell(batch)
+        self._pipeline.publish(batch)
 
     def _switch(
         self, connection: Connection, actor: str, vehicle: str, version: int, report: str | None, now: int

@@ -118,7 +118,7 @@ def _replay(
         work.add_recording(connection, row)
     kept = Counter[str]()
     with (
-        told_when_interrupted(kept, store.engine.url if keeps else None),
+        reporting_what_is_kept(kept, store.engine.url if keeps else None),
         progress(path.name, system.hop / system.sample_rate, quiet=json_lines) as show,
     ):
 
@@ -145,7 +145,7 @@ def _replay(
 
 
 @contextmanager
-def told_when_interrupted(kept: Counter[str], url: object | None) -> Iterator[None]:
+def reporting_what_is_kept(kept: Counter[str], url: object | None) -> Iterator[None]:
     """After Ctrl-C: what is stored, and how to continue.  url: of the store; None if it is temporary."""
     try:
         yield

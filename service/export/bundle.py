@@ -50,7 +50,7 @@ def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequ
             topic = f"/estimate/{parameter.element}/{parameter.quantity}"
             for i in np.flatnonzero(np.isfinite(value)).tolist():
                 file.write(topic, ESTIMATE, int(found.series.time[i]), estimate(value[i], std[i], parameter.nominal))
-        _told(file, found, excerpt, windows)
+        _contents(file, found, excerpt, windows)
         for alarm in found.alarms:
             _alarm(file, alarm)
         for mark in found.marks:
@@ -58,7 +58,7 @@ def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequ
     return sink.getvalue()
 
 
-def _told(file: McapSink, found: Bundle, excerpt: Excerpt | None, windows: Sequence[Compared]) -> None:
+def _contents(file: McapSink, found: Bundle, excerpt: Excerpt | None, windows: Sequence[Compared]) -> None:
     """An event that describes the contents of the file and what is missing."""
     text, level = found.reason, INFO
     if excerpt is None:

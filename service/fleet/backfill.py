@@ -212,7 +212,7 @@ def look(plan: BackfillPlan, file: FoundFile) -> FoundFile:
             return replace(file, problem="no samples of the system's channels")
         return replace(file, vehicle=vehicle_of(None, head.vehicle, Path(file.path).name), first_ns=head.first_ns)
     except Exception as error:  # the others go on
-        return replace(file, problem=told_of(error))
+        return replace(file, problem=message_of(error))
 
 
 def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
@@ -241,7 +241,7 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
                 add(piece.windows)
             ending = reading.ending
     except Exception as error:  # the others go on
-        return IdentifiedFile(file, tuple(messages), True, told_of(error))
+        return IdentifiedFile(file, tuple(messages), True, message_of(error))
     problem = "; ".join(ending.problems[:3]) if ending.incomplete else ""
     return IdentifiedFile(file, tuple(messages), ending.incomplete, problem)
 
@@ -363,7 +363,7 @@ def _of_file(file: FoundFile, problem: str) -> str:
     return problem if problem.startswith(file.path) else f"{file.path}: {problem}"  # readers mostly say whose it is
 
 
-def told_of(error: Exception) -> str:
+def message_of(error: Exception) -> str:
     """What is wrong with a recording, in one line."""
     expected = isinstance(error, ValueError | OSError)  # as readers say it
     text = str(error) or type(error).__name__ if expected else f"unexpected {type(error).__name__}: {error}"

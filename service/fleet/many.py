@@ -16,7 +16,7 @@ from sprung.service.diagnosis.task import DiagnosisRequest
 from sprung.service.diagnosis.worker import run
 from sprung.service.durable import sync_file
 from sprung.service.errors import UserError
-from sprung.service.fleet.backfill import FoundFile, list_recordings, local_copy, told_of
+from sprung.service.fleet.backfill import FoundFile, list_recordings, local_copy, message_of
 from sprung.service.fleet.tasks import Tasks, WorkLost
 from sprung.service.settings import Settings
 
@@ -82,7 +82,7 @@ def diagnose_file(order: DiagnosisOrder) -> DiagnosedFile:
             out.mkdir(parents=True, exist_ok=True)
             found = run(DiagnosisRequest(path, Path(file.path).name, system, dbc, out), lambda stage: None)
     except Exception as error:  # the others go on
-        return _failed(file, told_of(error))
+        return _failed(file, message_of(error))
     findings: list[dict[str, Any]] = found.report.get("findings", [])
     sentences = tuple(str(one.get("sentence") or f"{one['effect']} at {one['location']}") for one in findings)
     diagnosed = DiagnosedFile(file.path, found.verdict, sentences, "")

@@ -43,11 +43,11 @@ class NatsDelivery:
 
     async def done(self) -> None:
         """Acknowledge, and wait until the server knows."""
-        await _told(self._message.ack_sync())
+        await _acknowledged(self._message.ack_sync())
 
     async def again(self) -> None:
         """Ask for it later."""
-        await _told(self._message.nak(delay=AGAIN_SECONDS))
+        await _acknowledged(self._message.nak(delay=AGAIN_SECONDS))
 
 
 class NatsBroker:
@@ -150,12 +150,12 @@ class NatsLink:
         await ways[0]
 
 
-async def _told(telling: Awaitable[Any]) -> None:
+async def _acknowledged(sending: Awaitable[Any]) -> None:
     """Raises NotAcknowledged where the server does not hear it."""
     from nats.errors import Error
 
     try:
-        await telling
+        await sending
     except (Error, OSError, TimeoutError) as error:
         raise NotAcknowledged(type(error).__name__) from error
 

@@ -77,7 +77,7 @@ class Pipeline:
         self._on_alarms = on_alarms
         self._shown = staging is None
         self._vehicles: OrderedDict[str, HeldVehicle] = OrderedDict()
-        self._told: Newcomer | None = None
+        self._last_newcomer: Newcomer | None = None
         self._lock = threading.Lock()
         with store.write() as connection:
             self.model_id = fleet.ensure_model(
@@ -261,7 +261,7 @@ class Pipeline:
     def settle(self, folded: FoldedWindows) -> None:
         """The transaction of `fold` is committed: remember the tracker and tell every listener."""
         self._remember(folded.batch.vehicle, folded.after)
-        self.tell(folded.batch)
+        self.publish(folded.batch)
 
     def hold_all(self, connection: Connection, vehicles: Collection[str]) -> dict[str, HeldVehicle]:
         """Keep others from folding windows of some vehicles until the transaction ends; how their trackers stand."""
@@ -298,11 +298,11 @@ class Pipeline:
         if served.model_id != self.model_id:  # a model of its own: no other vehicle has learned under it
             return served.engine.tracker.initial_state()
         count, now = fleet.count_trackers(connection, self.model_id), self._clock()
-        held = self._told
+        held = self._last_newcomer
         if held is None or count >= FRESH_GROWTH * held.vehicles or not 0 <= now - held.at < FRESH_NS:
             rows = fleet.latest_trackers(connection, self.model_id, LEARNED_FROM)
             state = self.engine.tracker.initial_state_from([self.engine.load_state(row.state) for row in rows])
-            self._told = held = Newcomer(count, now, state)
+            self._last_newcomer = held = Newcomer(count, now, state)
         return held.state
 
     def relearn(self, vehicle: str, names: Sequence[str] | None, connection: Connection) -> Batch:
@@ -320,7 +320,7 @@ class Pipeline:
         views = keep_changes(connection, [TrackerChange(vehicle, after)], now, on_alarms)
         return Batch(vehicle, [], [], 0, after.state, at.served, view=views.get(vehicle))
 
-    def tell(self, batch: Batch) -> None:
+    def publish(self, batch: Batch) -> None:
         """Let every listener know of a change that came without windows."""
         for listener in self._listeners:
             listener(batch)

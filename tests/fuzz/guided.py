@@ -121,7 +121,7 @@ def _here(kind: str, seconds: int, seed: int, keep: Path) -> None:
     atheris.Fuzz()
 
 
-def _told(kind: str, keep: Path, seen: set[str], what: str, data: bytes) -> None:
+def _report(kind: str, keep: Path, seen: set[str], what: str, data: bytes) -> None:
     """Print a fault the first time that it is seen, and keep the input."""
     place = what.split(": ", maxsplit=1)[0]
     if place not in seen:
@@ -144,7 +144,7 @@ def _recording(kind: str, keep: Path) -> Callable[[bytes], None]:
         outcome = MutantOutcome(kind)
         read_one(path, dbc, False, outcome)
         for fault in outcome.faults:
-            _told(kind, keep, seen, fault, data)
+            _report(kind, keep, seen, fault, data)
 
     return one
 
@@ -171,7 +171,7 @@ def _text(kind: str, keep: Path) -> Callable[[bytes], None]:
             import traceback
 
             where = traceback.extract_tb(error.__traceback__)[-1]
-            _told(
+            _report(
                 kind, keep, seen, f"{type(error).__name__} at {Path(where.filename).name}:{where.lineno}: {error}", data
             )
 

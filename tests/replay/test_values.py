@@ -200,7 +200,7 @@ def screened(
     account = Account()
     screen = PlausibilityCheck(channels, account, converter(channels))
     block = screen.check(SampleBlock(np.array(time), np.array(channel, dtype=np.int32), np.array(value)))
-    screen.tell()
+    screen.conclude()
     return block, account
 
 

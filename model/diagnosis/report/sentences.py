@@ -14,7 +14,7 @@ from sprung.model.laws import StructureLaw
 def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
     values = {p.name: p.words() for p in finding.parameters}
     try:
-        words = _told(finding) if finding.formula else term.law.sentence.format(**values)
+        words = _formula_in_words(finding) if finding.formula else term.law.sentence.format(**values)
     except (KeyError, IndexError):
         words = term.law.title
     if isinstance(term.law, StructureLaw) and term.variant:
@@ -32,7 +32,7 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
     return sentence
 
 
-def _told(finding: Finding) -> str:
+def _formula_in_words(finding: Finding) -> str:
     """A formula with its values, in words."""
     values = ", ".join(f"{p.name} = {p.words()}" for p in finding.parameters)
     hidden = f" with z' = {finding.memory}" if finding.memory else ""

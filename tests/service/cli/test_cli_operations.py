@@ -26,7 +26,7 @@ from sprung.service.cli import describe, main
 from sprung.service.cli.diagnose import text as text_of
 from sprung.service.cli.doctor import _bus
 from sprung.service.cli.parameters import parameter_table
-from sprung.service.cli.replay import incomplete_line, measurement_lines, slower_line, told_when_interrupted
+from sprung.service.cli.replay import incomplete_line, measurement_lines, reporting_what_is_kept, slower_line
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.views import vehicle_view
 from sprung.service.rendering.render import percent
@@ -230,7 +230,7 @@ def test_an_interrupt_tells_what_is_kept(tmp_path: Path) -> None:
 
 def test_what_an_interrupt_left_does_not_depend_on_the_name_of_its_folder(capsys: pytest.CaptureFixture[str]) -> None:
     for url, told in (("sqlite:////srv/sprung-depot/s.db", "7 windows are kept in sqlite:"), (None, "nothing is kept")):
-        with pytest.raises(KeyboardInterrupt), told_when_interrupted(Counter(windows=7), url):
+        with pytest.raises(KeyboardInterrupt), reporting_what_is_kept(Counter(windows=7), url):
             raise KeyboardInterrupt
         assert told in capsys.readouterr().err
 

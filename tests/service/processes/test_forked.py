@@ -234,7 +234,7 @@ def _relearn(pipeline: Pipeline, store: Store) -> None:
     """The state changes on this side only."""
     with store.write() as connection:
         batch = pipeline.relearn("a", None, connection)
-    pipeline.tell(batch)
+    pipeline.publish(batch)
 
 
 def test_a_vehicle_that_fails_leaves_the_others_as_they_were(engine: Engine, system: System, tmp_path: Path) -> None:
