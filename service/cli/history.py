@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
+from contextlib import closing
 from pathlib import Path
 
 from sprung.service.cli.options import time_of
 from sprung.service.cli.targets import check_file
 from sprung.service.errors import UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
-from sprung.service.monitoring.engine import load_engine
-from sprung.service.settings import settings_with
+from sprung.service.monitoring.engine import Engine, load_engine
+from sprung.service.settings import Settings, settings_with
 from sprung.service.store import fleet, history, open_store
 from sprung.service.store.archive import open_archive
 
@@ -43,26 +43,8 @@ def run(
     for name in parameters:
         if name not in known:
             raise UserError(f"--parameter {name}: {engine.system.name} has {', '.join(known[:3])}, ...")
-    begin, end = time_of("--since", since, 0), time_of("--until", until, FOREVER)
-    with ExitStack() as stack:
-        opened = open_store(settings.store_url)
-        stack.callback(opened.close)
-        with opened.read() as connection:
-            if not fleet.vehicle_exists(connection, vehicle):
-                raise UserError(f"{settings.store_url}: nothing is known of vehicle {vehicle!r}")
-            model = fleet.known_model(connection, engine.digest, engine.description())
-            if model is None:
-                raise UserError(f"{settings.store_url}: nothing was stored with this system")
-            found = history.series(
-                connection,
-                vehicle,
-                model,
-                begin,
-                end,
-                _seconds(resolution),
-                FOREVER,
-                history.older_windows(open_archive(settings.archive), vehicle, fleet.digest_of(connection, model)),
-            )
+    between = time_of("--since", since, 0), time_of("--until", until, FOREVER)
+    found = _series(settings, engine, vehicle, between, _seconds(resolution))
     body = history_file(engine, vehicle, parameters or known, found, kind)
     if out is None:
         sys.stdout.buffer.write(body)
@@ -71,6 +53,20 @@ def run(
         out.write_bytes(body)
         print(f"{out}: {len(found.time)} points of {len(parameters or known)} parameters", file=sys.stderr)
     return 0
+
+
+def _series(
+    settings: Settings, engine: Engine, vehicle: str, between: tuple[int, int], resolution: float
+) -> history.Series:
+    """The history of a vehicle in a store, ns from and to, and in its archive; resolution: s, 0 for single windows."""
+    with closing(open_store(settings.store_url)) as store, store.read() as connection:
+        if not fleet.vehicle_exists(connection, vehicle):
+            raise UserError(f"{settings.store_url}: nothing is known of vehicle {vehicle!r}")
+        model = fleet.known_model(connection, engine.digest, engine.description())
+        if model is None:
+            raise UserError(f"{settings.store_url}: nothing was stored with this system")
+        older = history.older_windows(open_archive(settings.archive), vehicle, fleet.digest_of(connection, model))
+        return history.series(connection, vehicle, model, *between, resolution, FOREVER, older)
 
 
 def _seconds(text: str) -> float:
