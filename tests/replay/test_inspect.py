@@ -177,7 +177,7 @@ def test_motion_and_force_alone_make_a_component_test(tmp_path: Path, capfd: pyt
     assert isinstance(rod, SupportInput) and rod.displacement is not None
     assert (rod.displacement.unit, file.sensors["cell"].unit) == ("mm", "kN")
     assert (file.time.column, file.time.unit) == ("T", "ms")
-    assert file.sample_rate == pytest.approx(100)  # friction is told by what it does within a cycle
+    assert file.sample_rate == pytest.approx(100)  # friction shows within a cycle
     capfd.readouterr()
     assert main(["system", str(path)]) == 0
     assert "component test" in capfd.readouterr().out
