@@ -15,7 +15,7 @@ from sprung.model.diagnosis.investigation.judgement import (
     unmeasured_share,
 )
 from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covariance
-from sprung.model.diagnosis.investigation.named_laws import with_named_laws
+from sprung.model.diagnosis.investigation.named_laws import with_laws_together, with_named_laws
 from sprung.model.diagnosis.investigation.next_finding import next_finding
 from sprung.model.diagnosis.investigation.redundant import without_redundant
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
@@ -66,7 +66,7 @@ def with_findings(state: Investigation, progress: Progress) -> Investigation:
         if state.calibrations and not before.calibrations:  # the search restarts with them in the model
             return with_findings(replace(state, notes=notes), progress)
         if len(state.found) == len(before.found):
-            break
+            return with_laws_together(state, lambda plain: with_findings(plain, progress))
         state = with_named_laws(before, state, lambda plain: with_findings(plain, progress), progress)
         state = without_redundant(state)
         if _still_rejected(state, before.fit) or another_structure(state):

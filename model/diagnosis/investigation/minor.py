@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
-from sprung.model.diagnosis.investigation.judgement import is_part, leaves_more_than_noise
+from sprung.model.diagnosis.investigation.judgement import is_part
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import INPUT
@@ -21,13 +21,17 @@ def untried(state: Investigation, candidates: Iterable[Candidate]) -> list[Candi
     """Candidates to be tried: no input faults, not found before, and no harmonics of the excitation."""
     return [
         h
-        for h in candidates
+        for h in sought(state, candidates)
         if h.family is not INPUT
-        and (state.options.unnamed or h.term.law.named)
         and not _repeats(state, h)
         and not _hopeless(state, h)
         and harmonic(state.problem.part, h.term, state.options.rules.plausible) is None
     ]
+
+
+def sought(state: Investigation, candidates: Iterable[Candidate]) -> list[Candidate]:
+    """The candidates without unnamed forces where these are not sought."""
+    return [h for h in candidates if state.options.unnamed or h.term.law.named]
 
 
 def _repeats(state: Investigation, candidate: Candidate) -> bool:
@@ -80,11 +84,23 @@ def is_minor(state: Investigation, trial: Trial) -> bool:
             left = float(np.sum(state.fit.noise.force**2))
             if trial.reduction < min(rules.minor_beside * found.trial.reduction, rules.most_left * left):
                 return True
-        elif trial.reduction < rules.minor_beside * _wald_statistic(
-            state.fit, state.given + index, found.trial.term.law
-        ):
-            return not _explains_most_of_the_rest(state, trial)
+        elif _is_minor_beside(state, index, trial):
+            return True
     return False
+
+
+def _is_minor_beside(state: Investigation, index: int, trial: Trial) -> bool:
+    """Whether a second law at the element of a finding may be an inaccuracy of the first.
+
+    That is a small one, unless it explains most of what is no noise, and a very small one in any case.  Laws that are
+    sought in place of an unnamed force are judged together (`named_laws`).
+    """
+    rules = state.options.rules.acceptance
+    first = _wald_statistic(state.fit, state.given + index, state.found[index].trial.term.law)
+    if trial.reduction < rules.minor_elsewhere * first:
+        return True
+    alone = state.options.unnamed
+    return alone and trial.reduction < rules.minor_beside * first and not _explains_most_of_the_rest(state, trial)
 
 
 def _of_all_springs(law: Law) -> bool:
@@ -92,9 +108,9 @@ def _of_all_springs(law: Law) -> bool:
 
 
 def _explains_most_of_the_rest(state: Investigation, trial: Trial) -> bool:
-    """Whether a small second law explains most of a residual that is far more than noise."""
-    most = trial.reduction > state.options.rules.verdict.carried * state.fit.chi_square
-    return most and leaves_more_than_noise(state)
+    """Whether a trial explains most of the residual's power beyond the expected one of noise."""
+    freedom = state.fit.count - state.fit.jacobian.shape[1]
+    return trial.reduction > state.options.rules.verdict.carried * (state.fit.chi_square - freedom)
 
 
 def _absorbed(state: Investigation, trial: Trial) -> bool:
@@ -110,13 +126,16 @@ def _absorbed(state: Investigation, trial: Trial) -> bool:
 def _wald_statistic(fit: Fit, index: int, found: Law) -> float:
     """Wald statistic of a term: the rise of chi-square without it, from its strength and its standard deviation.
 
+    Of several values, such as the two sides of a stop, the one nearest to its absence.
     found: its law before it was widened, which has one strength where the wider form may have two.
     """
-    term = fit.point.terms[index]
-    strength = (found.strength if isinstance(found, ElementLaw) else None) or 0
+    term, place = fit.point.terms[index], fit.place(index)
     if not term.parameters:
         return 0.0
-    absent = term.law.absent[strength] if isinstance(term.law, ElementLaw) else 0.0
-    size = term.parameters[strength] - (absent if np.isfinite(absent) else 0.0)
-    place = fit.place(index).start + strength
-    return float(size**2 / max(fit.covariance[place, place], 1e-300))
+    absent = np.zeros(len(term.parameters))
+    if isinstance(term.law, ElementLaw):
+        absent = np.where(np.isfinite(term.law.absent), term.law.absent, 0.0)
+    variances = np.maximum(np.diag(fit.covariance)[place], 1e-300)
+    statistics = np.subtract(term.parameters, absent) ** 2 / variances
+    strength = found.strength if isinstance(found, ElementLaw) else 0
+    return float(np.min(statistics) if strength is None else statistics[strength])

@@ -1,8 +1,9 @@
-"""Several named laws as an alternative to an unnamed (non-parametric) force, which explains more than each alone.
+"""Several named laws as an alternative to an unnamed force or a formula, which explains more than each of them alone.
 
 A valve and a stop of one strut are found one after the other if one of them leads the competition.  If an unnamed force
-explains far more than either, it leads, and no other law is tried at its place.  The search is then repeated without
-unnamed forces, and its result is kept if it explains nearly everything that the unnamed force does.
+explains far more than either, it leads, and no other law is tried at its place; a formula may be their sum.  The search
+is then repeated without unnamed forces, and its result is kept if it explains nearly everything that the unnamed force
+does, or as much as the formula by evidence.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
-from sprung.model.diagnosis.selection.compete import noise_bound
+from sprung.model.diagnosis.selection.compete import cost, noise_bound
+from sprung.model.diagnosis.selection.evidence import profile_gain
 from sprung.model.laws import ElementLaw
 
 
@@ -21,25 +23,35 @@ def with_named_laws(
     """The investigation with named laws if they explain as much as the unnamed force, else that with the force.
 
     before: without that force; search: findings until the residual is noise.  A formula is kept if its residual is
-    noise, or smaller than that of the named laws.
+    smaller than that of the named laws or, where both leave noise, if its evidence is higher.
     """
-    if unnamed.problem.process_noise or _needs_no_names(unnamed):
+    last = unnamed.found[-1]
+    if unnamed.problem.process_noise or (last.trial.named and not _is_formula(last)):
         return unnamed
     progress(0.3 + 0.17 * len(before.found), "named laws in place of an unnamed force")
     named = search(replace(before, options=replace(before.options, unnamed=False)))
     if len(named.found) <= len(before.found) or not _explains_as_much(before, unnamed, named):
         return unnamed
-    if _is_formula(unnamed.found[-1]):
+    if _is_formula(last):
         unnamed = search(unnamed)  # further findings beside a formula count like those beside named laws
         if not _explains_as_much(before, unnamed, named):
             return unnamed
     return replace(named, options=before.options)
 
 
-def _needs_no_names(unnamed: Investigation) -> bool:
-    """Whether the last finding is named, or a formula whose residual is noise."""
-    trial = unnamed.found[-1].trial
-    return trial.named and not (_is_formula(unnamed.found[-1]) and _excess_chi_square(unnamed, unnamed) > 0)
+def with_laws_together(state: Investigation, search: Callable[[Investigation], Investigation]) -> Investigation:
+    """The investigation, whose search has ended, with further named laws if these leave nearly nothing but noise.
+
+    A clearance and a stop are first told as a cubic spring; each of them is small beside it, and both replace it.
+    """
+    if not state.found or not state.options.unnamed or state.problem.process_noise:
+        return state
+    if _excess_chi_square(state, state) == 0:
+        return state
+    named = search(replace(state, options=replace(state.options, unnamed=False)))
+    if named.found is state.found or not _explains_as_much(state, state, named):
+        return state
+    return replace(named, options=state.options)
 
 
 def _is_formula(found: AcceptedFinding) -> bool:
@@ -54,9 +66,22 @@ def _explains_as_much(before: Investigation, unnamed: Investigation, named: Inve
         if named.fit.bounded:  # values at their bounds are no better than a formula
             return False
         most = min(most, _excess_chi_square(unnamed, unnamed))
-    if _excess_chi_square(named, unnamed) > most:
+    if _excess_chi_square(named, unnamed) > most or (most == 0 and _evidence(before, unnamed, named) < 0):
         return False
     return not (before.options.held_out and unnamed.held.compare(unnamed.fit, named.fit).refuted)
+
+
+def _evidence(before: Investigation, unnamed: Investigation, named: Investigation) -> float:
+    """Evidence of the named laws over the formula, each beside its further findings."""
+    rules, judge = before.options.rules.evidence, unnamed.fit
+    residual = judge.whitener(named.fit.spectrum, unnamed.problem.part)
+    gain = profile_gain(judge.residual, residual, len(unnamed.problem.sensors), rules.quiet, rules)
+    first = before.given + len(before.found)
+    costs = [
+        sum(cost(state.fit, rules, index) for index in range(first, len(state.fit.point.terms)))
+        for state in (unnamed, named)
+    ]
+    return gain + costs[0] - costs[1]
 
 
 def _excess_chi_square(state: Investigation, judge: Investigation) -> float:

@@ -17,7 +17,7 @@ from sprung.model.diagnosis.investigation.calibration import (
 )
 from sprung.model.diagnosis.investigation.formula_trial import with_formula
 from sprung.model.diagnosis.investigation.masses import imitates_errors, with_errors_instead
-from sprung.model.diagnosis.investigation.minor import is_minor, untried
+from sprung.model.diagnosis.investigation.minor import is_minor, sought, untried
 from sprung.model.diagnosis.investigation.setup import misfit
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
 from sprung.model.diagnosis.investigation.surface import with_surface
@@ -102,6 +102,8 @@ def _candidates(state: Investigation) -> list[Candidate]:
     error = float(np.sqrt(np.mean(misfit(state.fit))))
     gross = not state.problem.process_noise and error > rules.selection.gross
     screening = without_calibrations(state)
+    # what is not sought sets no scale for the others
+    screening = replace(screening, candidates=tuple(sought(state, screening.candidates)))
     return untried(state, shortlist(screening, rules.acceptance.alpha, options.multiplicity, rules, gross=gross))
 
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.api import Options
-from sprung.model.diagnosis.investigation import minor
-from sprung.model.diagnosis.investigation.named_laws import with_named_laws
+from sprung.model.diagnosis.investigation import minor, named_laws
+from sprung.model.diagnosis.investigation.named_laws import with_laws_together, with_named_laws
+from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import find_law
 from sprung.model.laws.formula import formula_law
 
@@ -70,27 +71,76 @@ def test_laws_with_names_stand_where_they_leave_next_to_nothing(left: float, ref
 
 
 @pytest.mark.parametrize(
-    ("formula", "names", "bounded", "taken"),
-    [(1.0, 1.0, False, False), (4.0, 1.3, False, True), (4.0, 1.3, True, False), (4.0, 4.1, False, False)],
+    ("formula", "names", "bounded", "evidence", "taken"),
+    [
+        (1.0, 1.0, False, 5.0, True),
+        (1.0, 1.0, False, -5.0, False),
+        (1.0, 1.0, True, 5.0, False),
+        (4.0, 1.3, False, 5.0, True),
+        (4.0, 1.3, True, 5.0, False),
+        (4.0, 4.1, False, 5.0, False),
+    ],
 )
-def test_a_formula_that_leaves_more_than_noise_makes_way_for_names_that_leave_less(
-    formula: float, names: float, bounded: bool, taken: bool
+def test_a_formula_makes_way_for_names_that_leave_less_or_where_both_leave_noise_have_more_evidence(
+    formula: float, names: float, bounded: bool, evidence: float, taken: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def search(state: Any) -> Any:
         return state if state.found else _Stand(names, VALVE_AND_STOP, options=state.options, bounded=bounded)
 
+    monkeypatch.setattr(named_laws, "_evidence", lambda before, unnamed, named: evidence)
     told: Any = _Stand(formula, (FORMULA,))
     chosen: Any = with_named_laws(_Stand(400.0), told, search, lambda share, text: None)  # type: ignore[arg-type]
     assert (chosen.found == VALVE_AND_STOP) is taken
 
 
-@pytest.mark.parametrize(
-    ("reduction", "noisy", "counts"), [(90.0, True, True), (90.0, False, False), (40.0, True, False)]
-)
-def test_a_small_second_law_counts_where_it_explains_most_of_what_is_no_noise(
-    reduction: float, noisy: bool, counts: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("left", "names", "taken"), [(4.0, 1.0, True), (4.0, 3.0, False), (1.0, 1.0, False)])
+def test_a_law_that_leaves_more_than_noise_makes_way_for_laws_that_together_leave_noise(
+    left: float, names: float, taken: bool
 ) -> None:
-    monkeypatch.setattr(minor, "leaves_more_than_noise", lambda state: noisy)
-    state: Any = SimpleNamespace(options=Options(), fit=SimpleNamespace(chi_square=100.0))
-    found: Any = SimpleNamespace(reduction=reduction)
-    assert minor._explains_most_of_the_rest(state, found) is counts
+    def search(state: Any) -> Any:
+        assert not state.options.unnamed
+        return _Stand(names, VALVE_AND_STOP, options=state.options)
+
+    spring: Any = _Stand(left, (_found(find_law("cubic_stiffness")),))
+    chosen: Any = with_laws_together(spring, search)
+    assert (chosen.found == VALVE_AND_STOP) is taken
+    assert chosen.options.unnamed
+
+
+@pytest.mark.parametrize(
+    ("strength", "reduction", "unnamed", "is_one"),
+    [
+        (30.0, 60.0, True, False),
+        (100.0, 60.0, True, False),
+        (100.0, 40.0, True, True),
+        (100.0, 40.0, False, False),
+        (200.0, 60.0, True, True),
+        (200.0, 60.0, False, True),
+    ],
+)
+def test_a_small_law_beside_another_is_minor_unless_it_explains_most_of_what_is_no_noise_or_all_are_judged_together(
+    strength: float, reduction: float, unnamed: bool, is_one: bool
+) -> None:
+    term = Term(find_law("cubic_stiffness"), "spring", (strength,), scales=(1.0,))
+    fit = SimpleNamespace(
+        chi_square=1100.0,
+        count=1010,
+        jacobian=np.zeros((1, 10)),
+        point=SimpleNamespace(terms=(term,)),
+        covariance=np.eye(1),
+        place=lambda index: slice(0, 1),
+    )
+    first: Any = SimpleNamespace(trial=SimpleNamespace(term=term))
+    state: Any = SimpleNamespace(options=Options(unnamed=unnamed), fit=fit, given=0, found=(first,))
+    second: Any = SimpleNamespace(reduction=reduction)
+    assert minor._is_minor_beside(state, 0, second) is is_one
+
+
+def test_the_statistic_of_a_stop_with_two_sides_is_that_of_the_weaker_side() -> None:
+    wide = find_law("bump_stop").wider
+    term = Term(wide, "spring", (0.005, 4e5, 0.006, 2e5), scales=(1e-3, 1e5, 1e-3, 1e5))
+    covariance = np.diag([1e-12, 4e8, 1e-12, 4e8])
+    point = SimpleNamespace(terms=(term,))
+    fit: Any = SimpleNamespace(point=point, covariance=covariance, place=lambda index: slice(0, 4))
+    assert minor._wald_statistic(fit, 0, wide) == pytest.approx(100.0)
+    assert minor._wald_statistic(fit, 0, find_law("bump_stop")) == pytest.approx(400.0)
