@@ -109,8 +109,8 @@ def _of_all_springs(law: Law) -> bool:
 
 def _explains_most_of_the_rest(state: Investigation, trial: Trial) -> bool:
     """Whether a trial explains most of the residual's power beyond the expected one of noise."""
-    freedom = state.fit.count - state.fit.jacobian.shape[1]
-    return trial.reduction > state.options.rules.verdict.carried * (state.fit.chi_square - freedom)
+    noise = state.fit.count - state.fit.jacobian.shape[1]
+    return bool(trial.reduction > state.options.rules.verdict.carried * (state.fit.chi_square - noise))
 
 
 def _absorbed(state: Investigation, trial: Trial) -> bool:

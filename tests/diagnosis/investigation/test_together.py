@@ -137,10 +137,11 @@ def test_a_small_law_beside_another_is_minor_unless_it_explains_most_of_what_is_
 
 
 def test_the_statistic_of_a_stop_with_two_sides_is_that_of_the_weaker_side() -> None:
-    wide = find_law("bump_stop").wider
+    narrow: Any = find_law("bump_stop")
+    wide = narrow.wider
     term = Term(wide, "spring", (0.005, 4e5, 0.006, 2e5), scales=(1e-3, 1e5, 1e-3, 1e5))
     covariance = np.diag([1e-12, 4e8, 1e-12, 4e8])
     point = SimpleNamespace(terms=(term,))
     fit: Any = SimpleNamespace(point=point, covariance=covariance, place=lambda index: slice(0, 4))
     assert minor._wald_statistic(fit, 0, wide) == pytest.approx(100.0)
-    assert minor._wald_statistic(fit, 0, find_law("bump_stop")) == pytest.approx(400.0)
+    assert minor._wald_statistic(fit, 0, narrow) == pytest.approx(400.0)
