@@ -23,10 +23,10 @@ def with_named_laws(
     """The investigation with named laws if they explain as much as the unnamed force, else that with the force.
 
     before: without that force; search: findings until the residual is noise.  A formula is kept if its residual is
-    smaller than that of the named laws or, where both leave noise, if its evidence is higher.
+    smaller than that of the named laws or, where both leave noise, if it is a single shape or its evidence is higher.
     """
     last = unnamed.found[-1]
-    if unnamed.problem.process_noise or (last.trial.named and not _is_formula(last)):
+    if unnamed.problem.process_noise or _needs_no_names(unnamed):
         return unnamed
     progress(0.3 + 0.17 * len(before.found), "named laws in place of an unnamed force")
     named = search(replace(before, options=replace(before.options, unnamed=False)))
@@ -37,6 +37,14 @@ def with_named_laws(
         if not _explains_as_much(before, unnamed, named):
             return unnamed
     return replace(named, options=before.options)
+
+
+def _needs_no_names(unnamed: Investigation) -> bool:
+    """Whether the last finding is named, or a formula of one shape, which is no sum of laws, that leaves noise."""
+    last = unnamed.found[-1]
+    if not _is_formula(last):
+        return last.trial.named
+    return last.trial.term.element_law.strength is not None and _excess_chi_square(unnamed, unnamed) == 0
 
 
 def with_laws_together(state: Investigation, search: Callable[[Investigation], Investigation]) -> Investigation:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +19,7 @@ from sprung.model.laws.formula import formula_law
 
 def _found(law: object) -> Any:
     named = getattr(law, "named", False)
-    return SimpleNamespace(trial=SimpleNamespace(named=named, term=SimpleNamespace(law=law)))
+    return SimpleNamespace(trial=SimpleNamespace(named=named, term=SimpleNamespace(law=law, element_law=law)))
 
 
 SURFACE, FORMULA = _found(None), _found(formula_law("a * d * abs(v)", "", ("a",)))
@@ -91,6 +91,15 @@ def test_a_formula_makes_way_for_names_that_leave_less_or_where_both_leave_noise
     told: Any = _Stand(formula, (FORMULA,))
     chosen: Any = with_named_laws(_Stand(400.0), told, search, lambda share, text: None)  # type: ignore[arg-type]
     assert (chosen.found == VALVE_AND_STOP) is taken
+
+
+def test_no_names_are_sought_in_place_of_a_single_shape_that_leaves_noise() -> None:
+    def search(state: Any) -> Any:
+        raise AssertionError
+
+    single = _found(replace(formula_law("a * d * abs(v)", "", ("a",)), strength=0))
+    told: Any = _Stand(1.0, (single,))
+    assert with_named_laws(_Stand(400.0), told, search, lambda share, text: None) is told  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("left", "names", "taken"), [(4.0, 1.0, True), (4.0, 3.0, False), (1.0, 1.0, False)])
