@@ -180,6 +180,9 @@ class PlausibleRules:
     weighed: float = rule(
         0.015, "of a body's mass, its deviation where the file states none; chosen: as a gain's", 0.01, 0.03
     )
+    masses: float = rule(
+        0.3, "of a body's mass, deviation of the prior beyond that; chosen: undetermined ones stay near", 0.1, 1.0
+    )
     slow_mode: float = rule(
         0.5, "times the slowest mode on springs, below which no body bends; chosen: it is lighter", 0.3, 0.8
     )

@@ -147,7 +147,7 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     Errors of instruments beyond the tolerance beside the findings so far are left out, to be found as faults.  Gains of
     the inputs are kept fixed from now on: their common part is only identifiable from the curvature of a law.
     """
-    file, terms = state.fit.point.terms[: state.given], (*of_all_channels(state), *_of_all_bodies(state))
+    file, terms = state.fit.point.terms[: state.given], calibration_terms(state)
     keys = {term.key for term in terms}
     found = tuple(term for term in state.fit.point.terms[state.given :] if term.key not in keys)
     for _ in range(2):
@@ -176,12 +176,12 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
 
 
 def _freed_beyond_tolerance(state: Investigation, terms: Sequence[Term]) -> Iterator[Term]:
-    """Terms within tolerance, and masses beyond without a prior; other errors beyond are to be found as faults."""
+    """Terms within tolerance, and masses beyond with a wide prior; other errors beyond are to be found as faults."""
     for term in terms:
         if within_data_sheet(state, term):
             yield term
         elif term.law is MASS_CHANGE:
-            yield replace(term, known=())
+            yield replace(term, known=(state.options.rules.plausible.masses,))
 
 
 def with_free_gains(state: Investigation, fit: Fit) -> Fit:
@@ -219,21 +219,38 @@ def _is_observable(law: SensorLaw, *, rate: bool, support: bool) -> bool:
     return bool(slope.gain or (moved and not support) or (slope.offset and not rate and not support))
 
 
+def calibration_terms(state: Investigation) -> tuple[Term, ...]:
+    """Calibration errors of all channels and bodies, with values as found."""
+    return (*_of_all_channels(state), *_of_all_bodies(state))
+
+
 def _of_all_bodies(state: Investigation) -> Iterator[Term]:
-    """Masses of bodies that the system file does not estimate, as found."""
-    estimated, rules = {p.name for p in state.system.parameters}, state.options.rules.plausible
-    given = {term.key[:2] for term in state.fit.point.terms[: state.given]}
+    """Masses of bodies that the system file does not estimate, as found.
+
+    Without a measured force, the heaviest body's is kept: masses are then known up to a common factor only.
+    """
+    system, rules = state.problem.system, state.options.rules.plausible
+    known = {p.name.removesuffix(f".{MASS_CHANGE.scales}") for p in system.parameters}
+    known |= {term.location for term in state.fit.point.terms[: state.given] if term.law is MASS_CHANGE}
+    if not measures_force(system):
+        known.add(max(system.bodies, key=lambda name: system.file.bodies[name].mass.value))
     values = {term.key: term.parameters for term in state.fit.point.terms[state.given :]}
-    for name in state.system.bodies:
-        if f"{name}.{MASS_CHANGE.scales}" in estimated or (name, MASS_CHANGE.name) in given:
+    for name in system.bodies:
+        if name in known:
             continue
-        spread = expected(state.system, state.signals, MASS_CHANGE, name, rules)
+        spread = expected(system, state.signals, MASS_CHANGE, name, rules)
         nothing = Term(MASS_CHANGE, name, MASS_CHANGE.absent, scales=(spread,), known=(spread,))
         as_found = replace(nothing, parameters=values.get(nothing.key, MASS_CHANGE.absent))
-        yield as_found if within_data_sheet(state, as_found) else replace(as_found, known=())
+        yield as_found if within_data_sheet(state, as_found) else replace(as_found, known=(rules.masses,))
 
 
-def of_all_channels(state: Investigation) -> tuple[Term, ...]:
+def measures_force(system: System) -> bool:
+    """Whether a force is measured, as an input or by a sensor, so that masses are known absolutely."""
+    measured = (*system.file.inputs.values(), *system.file.sensors.values())
+    return any(one.kind == "force" for one in measured)
+
+
+def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
     """Gain, zero and delay of every sensor, the first two of measured forces, gains of supports; values as found."""
     signals, part = state.signals, state.problem.part
     laws = [law for law in state.problem.system.catalogue if isinstance(law, SensorLaw)]

@@ -16,7 +16,7 @@ from sprung.model.diagnosis.investigation.calibration import (
     without_calibrations,
 )
 from sprung.model.diagnosis.investigation.formula_trial import with_formula
-from sprung.model.diagnosis.investigation.masses import imitates_errors, with_errors_instead
+from sprung.model.diagnosis.investigation.masses import imitates_errors
 from sprung.model.diagnosis.investigation.minor import is_minor, sought, untried
 from sprung.model.diagnosis.investigation.setup import misfit
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
@@ -72,18 +72,15 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
 def _with_leading(state: Investigation, competition: _Competition, progress: Callable[[str], None]) -> Investigation:
     """The investigation with the leading candidate as a finding; without it if it may be chance, or is refuted.
 
-    A candidate within the data sheet of its instrument is not a finding: all instruments are calibrated then.
+    A candidate within the data sheet of its instrument is not a finding, nor is one that other masses and instruments
+    together explain better: masses and instruments are calibrated then.
     """
     trials, note = with_formula(state, competition.findings, competition.leading)
     chosen = trials[0]
-    if imitates_errors(state, chosen) and not _is_refuted(state, chosen):
-        state, chosen = with_errors_instead(state, chosen)
-        if state.calibrations:
-            return state
     p_value = _p_value(state, chosen)
     if _is_refuted(state, chosen) or p_value > state.options.rules.acceptance.alpha:
         return state
-    if state.calibrations is None and may_be_calibration(state, chosen.term):
+    if state.calibrations is None and (may_be_calibration(state, chosen.term) or imitates_errors(state, chosen)):
         state = calibrated(state, chosen.term)
         if state.calibrations:
             return state

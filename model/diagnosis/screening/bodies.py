@@ -56,7 +56,8 @@ def _masses(projector: Projector, law: BodyLaw) -> Iterator[tuple[Candidate, int
         scores = [projector.score(column, (spread, 0.0)) for column, spread in zip(shown, spreads, strict=True)]
     for name, (score, amplitude) in zip(held, scores, strict=True):
         ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
-        yield Candidate(Term(law, name, (ratio,), variant="", scales=(0.1,)), score, MASS), 1
+        term = Term(law, name, (ratio,), scales=(0.1,), known=(problem.rules.plausible.masses,))
+        yield Candidate(term, score, MASS), 1
 
 
 def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterator[tuple[Candidate, int]]:
