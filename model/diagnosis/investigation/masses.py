@@ -10,16 +10,20 @@ from __future__ import annotations
 from sprung.model.diagnosis.investigation.calibration import calibration_terms
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.terms import evaluated_in_time
-from sprung.model.diagnosis.selection.compete import Trial, evidence_together
+from sprung.model.diagnosis.selection.compete import Trial, gain_together
 from sprung.model.laws.bodies import MASS_CHANGE
 
 _STEPS = 6  # of the fit of all errors, from the present model
 
 
 def imitates_errors(state: Investigation, chosen: Trial) -> bool:
-    """Whether a linear part has less evidence than other masses and calibration errors have together."""
+    """Whether a linear part explains less than other masses and calibration errors together.
+
+    These are not charged for what they are: they exist on every rig, only their sizes are unknown.
+    """
     if state.calibrations is not None or evaluated_in_time(chosen.term) or chosen.term.law is MASS_CHANGE:
         return False
     found = {term.key for term in state.fit.point.terms}
     errors = [term for term in calibration_terms(state) if term.key not in found]
-    return evidence_together(state.problem, state.fit, errors, _STEPS) > chosen.evidence
+    by_chance = state.options.rules.screening.per_freedom * len(errors)
+    return gain_together(state.problem, state.fit, errors, _STEPS) - by_chance > chosen.evidence

@@ -23,7 +23,6 @@ from sprung.model.diagnosis.selection.evidence import (
     chance,
     monotone_gains,
     occam_cost,
-    prior_cost,
     process_gain,
     profile_gain,
     unusual_cost,
@@ -297,17 +296,15 @@ def _gain(problem: Problem, base: Fit, fit: Fit, quiet: float) -> tuple[float, f
     return min(reduction, profile_gain(base.residual, fit.residual, sensors, quiet, rules)), reduction
 
 
-def evidence_together(problem: Problem, base: Fit, terms: Sequence[Term], iterations: int) -> float:
-    """Evidence of several terms at once over the base, those with priors included; -inf where their fit diverges."""
+def gain_together(problem: Problem, base: Fit, terms: Sequence[Term], iterations: int) -> float:
+    """Twice the log ratio of posteriors of several terms with priors over the base; -inf where their fit diverges."""
     point = replace(base.point, terms=(*base.point.terms, *terms))
     fit = try_optimise(problem, point, iterations, base.whitener)
     if fit is None:
         return -np.inf
-    rules, first = problem.rules.evidence, len(base.point.terms)
-    gain, _ = _gain(problem, base, fit, rules.quiet)
-    for index, term in enumerate(fit.point.terms[first:], first):
-        gain -= cost(fit, rules, index) + float(np.sum(term.prior_deviations**2))
-    return gain
+    gain, _ = _gain(problem, base, fit, problem.rules.evidence.quiet)
+    fitted = fit.point.terms[len(base.point.terms) :]
+    return gain - sum(float(np.sum(term.prior_deviations**2)) for term in fitted)
 
 
 def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> list[Trial]:
@@ -326,8 +323,6 @@ def cost(fit: Fit, rules: EvidenceRules = RULES.evidence, index: int = -1) -> fl
     block = fit.covariance[place, place]
     if not term.law.named:  # amplitudes of one curve, correlated by convention: each counts by itself
         block = np.diag(np.diag(block))
-    if term.known:
-        return prior_cost(term.known, block)
     logs = [spec.log for spec in term.law.parameters]
     total = occam_cost(logs, term.scales, block / np.outer(term.slopes, term.slopes), rules)
     for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):

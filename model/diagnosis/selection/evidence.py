@@ -124,14 +124,6 @@ def occam_cost(
     return max(0.0, _log_det(determined + prior) - _log_det(determined))
 
 
-def prior_cost(widths: Sequence[float], covariance: FloatArray) -> float:
-    """Occam factor of parameters with Gaussian priors: the log ratio of the prior's volume to the posterior's.
-
-    widths: standard deviations of the priors, (p,).  covariance: with the priors in it, (p, p).
-    """
-    return max(0.0, 2 * float(np.sum(np.log(widths))) - _log_det(covariance))
-
-
 def _log_det(covariance: FloatArray) -> float:
     """Of a covariance whose entries may differ by many orders."""
     size = np.sqrt(np.diag(covariance))

@@ -14,7 +14,6 @@ from sprung.model.diagnosis.selection.evidence import (
     level_gain,
     monotone_gains,
     occam_cost,
-    prior_cost,
     process_gain,
     profile_gain,
     unusual_cost,
@@ -111,10 +110,3 @@ def test_a_plainly_better_fit_does_not_lose_to_a_worse_one() -> None:
     # gains and chi-squares of three rivals as a sine test on a magneto-rheological damper gave them
     assert monotone_gains([312.0, 351.0, 290.0], [23.1, 41.8, 24.0]) == [312.0, 290.0, 290.0]
     assert monotone_gains([40.0, 44.0], [1000.0, 1010.0]) == [40.0, 44.0]
-
-
-def test_a_parameter_with_a_prior_costs_what_it_learned() -> None:
-    """Nothing if the posterior is the prior; log of the ratio of variances otherwise (Gaussian, known noise)."""
-    assert prior_cost([0.015, 2.0], np.diag([0.015**2, 4.0])) == pytest.approx(0.0, abs=1e-9)
-    posterior = 1 / (1 / 0.015**2 + 1 / 0.001**2)
-    assert prior_cost([0.015], np.array([[posterior]])) == pytest.approx(np.log(1 + 15.0**2))
