@@ -11,6 +11,7 @@ from sprung.model.diagnosis.investigation.calibration import calibration_terms
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.terms import evaluated_in_time
 from sprung.model.diagnosis.selection.compete import Trial, gain_together
+from sprung.model.laws import SensorLaw
 from sprung.model.laws.bodies import MASS_CHANGE
 
 _STEPS = 6  # of the fit of all errors, from the present model
@@ -21,8 +22,11 @@ def imitates_errors(state: Investigation, chosen: Trial) -> bool:
 
     These are not charged for what they are: they exist on every rig, only their sizes are unknown.
     """
-    if state.calibrations is not None or evaluated_in_time(chosen.term) or chosen.term.law is MASS_CHANGE:
+    law = chosen.term.law
+    if state.calibrations is not None or evaluated_in_time(chosen.term) or law is MASS_CHANGE:
         return False
+    if isinstance(law, SensorLaw):
+        return False  # one of these errors itself: with it, they always explain more
     found = {term.key for term in state.fit.point.terms}
     errors = [term for term in calibration_terms(state) if term.key not in found]
     by_chance = state.options.rules.screening.per_freedom * len(errors)
