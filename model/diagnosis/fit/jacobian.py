@@ -185,7 +185,7 @@ def _add_terms(
                 known.loads[at] = inertial_load(forward, motions, term.location)
                 known.packed.add_load(at, known.loads[at])
                 if problem.process_noise:
-                    change = _inputs_by_mass(forward, term.location)
+                    change = forward.inputs_by_mass(term.location)[forward.part.grid.band]
                     known.log_det[at] = working.whitener.log_det_slope(change)
             elif forces is not None and evaluated_in_time(term):
                 port, change = law_change(forward, forces, term, j)
@@ -239,16 +239,7 @@ def _theta_forces(forward: Forward, motions: Motions) -> tuple[ComplexArray, dic
 
 def inertial_load(forward: Forward, motions: Motions, body: str) -> ComplexArray:
     """Load (F, n) on the degrees of freedom equivalent to d/d log of a body's mass and inertias."""
-    structure = forward.plant.structure
-    own = structure.body_of_dof == forward.system.bodies.index(body)
-    load: ComplexArray = np.where(own, -structure.mass * motions.acceleration, 0.0)
-    return load
-
-
-def _inputs_by_mass(forward: Forward, body: str) -> ComplexArray:
-    """Derivative of the response to inputs by the log of a body's mass, in the band."""
-    own = forward.plant.structure.body_of_dof == forward.system.bodies.index(body)
-    return forward.inputs_by_mass(own)[forward.part.grid.band]
+    return -forward.own_mass(body) * motions.acceleration
 
 
 def _difference(
@@ -299,7 +290,7 @@ def _log_det_slopes(forward: Forward, whitener: Whitener) -> FloatArray:
     for i, parameter in enumerate(forward.system.parameters):
         value = parameter.nominal * np.exp(forward.theta[i])
         if parameter.quantity == "mass":
-            change = _inputs_by_mass(forward, parameter.element)
+            change = forward.inputs_by_mass(parameter.element)[band]
         else:
             element = forward.system.elements.index(parameter.element)
             factor = value * (jw if parameter.quantity == "damping" else 1.0)

@@ -141,7 +141,7 @@ def centred(terms: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def calibrated(state: Investigation, first: Term) -> Investigation:
-    """The investigation with the calibration errors of all channels in its model, at the beginning of its search.
+    """The investigation with the calibration errors of all channels and bodies in its model, its search begun anew.
 
     first: the first that was found; if it is an outlier, it is a fault, and the model is not changed.
     Errors of instruments beyond the tolerance beside the findings so far are left out, to be found as faults.  Gains of
@@ -229,22 +229,25 @@ def _of_all_bodies(state: Investigation) -> Iterator[Term]:
 
     Without a measured force, the heaviest body's is kept: masses are then known up to a common factor only.
     """
-    system, rules = state.problem.system, state.options.rules.plausible
+    system = state.problem.system
     known = {p.name.removesuffix(f".{MASS_CHANGE.scales}") for p in system.parameters}
     known |= {term.location for term in state.fit.point.terms[: state.given] if term.law is MASS_CHANGE}
-    if not measures_force(system):
+    if not _measures_force(system):
         known.add(max(system.bodies, key=lambda name: system.file.bodies[name].mass.value))
+    free = (name for name in system.bodies if name not in known)
+    rules = state.options.rules.plausible
+    masses = [_as_found(state, MASS_CHANGE, n, expected(system, state.signals, MASS_CHANGE, n, rules)) for n in free]
+    return _freed_beyond_tolerance(state, masses)
+
+
+def _as_found(state: Investigation, law: Law, location: str, spread: float) -> Term:
+    """A calibration error of a standard deviation by the data sheet, with its value if it was found before."""
+    nothing = Term(law, location, law.absent, scales=(spread,), known=(spread,))
     values = {term.key: term.parameters for term in state.fit.point.terms[state.given :]}
-    for name in system.bodies:
-        if name in known:
-            continue
-        spread = expected(system, state.signals, MASS_CHANGE, name, rules)
-        nothing = Term(MASS_CHANGE, name, MASS_CHANGE.absent, scales=(spread,), known=(spread,))
-        as_found = replace(nothing, parameters=values.get(nothing.key, MASS_CHANGE.absent))
-        yield as_found if within_data_sheet(state, as_found) else replace(as_found, known=(rules.masses,))
+    return replace(nothing, parameters=values.get(nothing.key, law.absent))
 
 
-def measures_force(system: System) -> bool:
+def _measures_force(system: System) -> bool:
     """Whether a force is measured, as an input or by a sensor, so that masses are known absolutely."""
     measured = (*system.file.inputs.values(), *system.file.sensors.values())
     return any(one.kind == "force" for one in measured)
@@ -256,7 +259,6 @@ def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
     laws = [law for law in state.problem.system.catalogue if isinstance(law, SensorLaw)]
     rates = {name for name, rate in zip(signals.sensor_names, part.differentiated, strict=True) if rate}
     given = {term.key[:2] for term in state.fit.point.terms[: state.given]}
-    values = {term.key: term.parameters for term in state.fit.point.terms[state.given :]}
     found = []
     measured = tuple(
         f"{name}.{next(iter(source.measured))}"
@@ -271,6 +273,5 @@ def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
                 if not spread or channel not in law.at or (name, law.name) in given:
                     continue
                 if _is_observable(law, rate=name in rates, support=channel == "support"):
-                    nothing = Term(law, str(name), law.absent, scales=(spread,), known=(spread,))
-                    found.append(replace(nothing, parameters=values.get(nothing.key, law.absent)))
+                    found.append(_as_found(state, law, str(name), spread))
     return tuple(found)

@@ -23,10 +23,9 @@ def imitates_errors(state: Investigation, chosen: Trial) -> bool:
     These are not charged for what they are: they exist on every rig, only their sizes are unknown.
     """
     law = chosen.term.law
-    if state.calibrations is not None or evaluated_in_time(chosen.term) or law is MASS_CHANGE:
+    is_error = law is MASS_CHANGE or isinstance(law, SensorLaw)  # with it, all together always explain more
+    if state.calibrations is not None or evaluated_in_time(chosen.term) or is_error:
         return False
-    if isinstance(law, SensorLaw):
-        return False  # one of these errors itself: with it, they always explain more
     found = {term.key for term in state.fit.point.terms}
     errors = [term for term in calibration_terms(state) if term.key not in found]
     by_chance = state.options.rules.screening.per_freedom * len(errors)

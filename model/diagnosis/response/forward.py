@@ -193,11 +193,16 @@ class Forward:
         found: ComplexArray = both * self.sensor_factor[:, :, None] / gains
         return found
 
-    def inputs_by_mass(self, dofs: np.ndarray) -> ComplexArray:
-        """Derivative of `of_inputs` by the log of the mass at degrees of freedom (n,), (F, S, inputs)."""
-        plant, s = self.plant, self.plant.structure
+    def own_mass(self, body: str) -> FloatArray:
+        """Mass and inertias of a body at its own degrees of freedom, 0 at the others, (n,)."""
+        structure = self.plant.structure
+        return np.where(structure.body_of_dof == self.system.bodies.index(body), structure.mass, 0.0)
+
+    def inputs_by_mass(self, body: str) -> ComplexArray:
+        """Derivative of `of_inputs` by the log of a body's mass and inertias, (F, S, inputs)."""
+        plant = self.plant
         moved = plant.receptance @ plant.load_of_inputs
-        inertia = (self.part.grid.omega**2)[:, None, None] * (s.mass * dofs)[:, None]
+        inertia = (self.part.grid.omega**2)[:, None, None] * self.own_mass(body)[:, None]
         found: ComplexArray = plant.sensor_of_load @ (inertia * moved) * self.sensor_factor[:, :, None]
         return found
 

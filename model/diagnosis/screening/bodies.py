@@ -41,7 +41,7 @@ def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tup
 def _masses(projector: Projector, law: BodyLaw) -> Iterator[tuple[Candidate, int]]:
     """Other masses of bodies; stiffness and damping absorb most of them, so that the laws' reaction counts."""
     fit, problem, band = projector.fit, projector.problem, projector.grid.band
-    structure, estimated = fit.forward.plant.structure, {p.name for p in problem.system.parameters}
+    estimated = {p.name for p in problem.system.parameters}
     held = [name for name in problem.system.bodies if f"{name}.{law.scales}" not in estimated]
     loads = [inertial_load(fit.forward, fit.motions, name) for name in held]
     if held and fit.forces is not None and not problem.process_noise:
@@ -50,8 +50,8 @@ def _masses(projector: Projector, law: BodyLaw) -> Iterator[tuple[Candidate, int
     else:
         shown = [projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load[band])) for load in loads]
         spreads = [
-            projector.spread(column, fit.forward.inputs_by_mass(structure.body_of_dof == index)[band])
-            for column, index in zip(shown, map(problem.system.bodies.index, held), strict=True)
+            projector.spread(column, fit.forward.inputs_by_mass(name)[band])
+            for column, name in zip(shown, held, strict=True)
         ]
         scores = [projector.score(column, (spread, 0.0)) for column, spread in zip(shown, spreads, strict=True)]
     for name, (score, amplitude) in zip(held, scores, strict=True):
