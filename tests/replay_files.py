@@ -108,14 +108,16 @@ float32 right
 """
 
 
-def write_ros2(path: Path, stamped: bool = True) -> None:
+def write_ros2(path: Path, stamped: bool = True, bursts: int = 1) -> None:
+    """bursts: messages that are logged together, after the last of them."""
     with path.open("wb") as file:
         writer = Ros2Writer(file)
         schema = writer.register_msgdef("test_msgs/Body", ROS_BODY)
         for row in range(ROWS):
             stamp = int(TIMES[row]) if stamped else 0
             header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "b"}
-            late = int(TIMES[row]) + (7_000_000 if stamped else 0)
+            last = min(row - row % bursts + bursts, ROWS) - 1
+            late = int(TIMES[last]) + (7_000_000 if stamped else 0)
             writer.write_message("/body/acceleration", schema, {"header": header, **document(row)}, late, late)
         writer.finish()
 

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sprung.model.system import load_system
+from sprung.benchmarks.generator import read_vehicle
+from sprung.benchmarks.generator.files import WRITERS
+from sprung.model.system import MANCHESTER
 from sprung.service.cli import main
+from tests.rides import Ride, cut_off, make_ride, with_losses
 
 DRIFT = Path(__file__).parent / "data" / "drift-600s.blf"
-SHARED = Path(__file__).parents[1].parent / "shared" / "recordings"
 # What drifts in the bundled recording: parameter, share lost in the end, time constant (from 5 s before its start).
 DRIFTING = (("secondary_2l.damping", 0.45, 250.0), ("primary_12r.stiffness", 0.2, 300.0))
 
@@ -22,16 +24,14 @@ def replay(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int,
     return status, [json.loads(line) for line in captured.out.splitlines()], captured.err
 
 
-def shared(name: str) -> Path:
-    path = SHARED / name
-    if not path.exists():
-        pytest.skip(f"{name} is not at hand")
-    return path
+@pytest.fixture(scope="module")
+def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+    return make_ride(tmp_path_factory.mktemp("ride") / "healthy.mcap", 60.0, seed=5)
 
 
-def labels(name: str) -> dict[str, float]:
-    truth = json.loads(shared("labels.json").read_text())[name]
-    return {f"{e}.{q}": v for q in ("stiffness", "damping") for e, v in truth[q].items()}
+def within(summary: dict[str, Any], ride: Ride) -> int:
+    """Parameters of the 24 whose true value is less than three of their standard deviations off."""
+    return sum(abs(p["value"] - ride.truth[p["name"]]) < 3 * p["std"] for p in summary["parameters"])
 
 
 def test_the_bundled_recording_shows_two_parameters_drift_and_no_other(capsys: pytest.CaptureFixture[str]) -> None:
@@ -53,62 +53,46 @@ def test_the_bundled_recording_shows_two_parameters_drift_and_no_other(capsys: p
 
 
 def test_a_healthy_vehicle_is_measured_within_its_intervals_and_raises_no_alarm(
-    capsys: pytest.CaptureFixture[str],
+    ride: Ride, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, lines, _ = replay(capsys, shared("healthy-120s.mcap"))
+    status, lines, _ = replay(capsys, ride.path)
     summary = lines[-1]["summary"]
-    truth = labels("healthy-120s.mcap")
-    z = [abs(p["value"] - truth[p["name"]]) / p["std"] for p in summary["parameters"]]
     assert status == 0
     assert summary["alarms"] == []
-    assert np.sum(np.array(z) < 3) >= 23
+    assert summary["windows"]["used"] == 119
+    assert within(summary, ride) >= 23
 
 
-@pytest.mark.parametrize(("name", "foreign"), [("lossy-30s.mcap", False), ("lossy-30s.blf", True)])
-def test_losses_are_counted_and_told_in_one_line(capsys: pytest.CaptureFixture[str], name: str, foreign: bool) -> None:
-    status, lines, errors = replay(capsys, shared(name))
+@pytest.mark.parametrize("kind", ["mcap", "blf"])
+def test_losses_are_counted_and_told_in_one_line(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ride = with_losses(make_ride(tmp_path / f"whole.{kind}", 30.0, seed=6), tmp_path / f"lossy.{kind}")
+    status, lines, errors = replay(capsys, ride.path)
     summary = lines[-1]["summary"]
-    truth = labels(name)
     assert status == 1
     assert len(errors.strip().splitlines()) == 1
     assert "lost" in errors or "missing" in errors
-    assert (summary["frames"]["foreign"] > 0) == foreign
+    assert summary["frames"]["foreign"] == ride.foreign
+    assert (ride.foreign > 0) == (kind == "blf")
     assert sum(summary["windows"].values()) >= 58
     assert all(line["reason"] for line in lines[:-1] if line["outcome"] != "used")
-    z = [abs(p["value"] - truth[p["name"]]) / p["std"] for p in summary["parameters"]]
-    assert np.sum(np.array(z) < 3) >= 22
+    assert within(summary, ride) >= 22
 
 
-def test_a_truncated_file_is_used_up_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
-    status, lines, errors = replay(capsys, shared("truncated-30s.mcap"))
+def test_a_truncated_file_is_used_up_to_its_end(ride: Ride, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, lines, errors = replay(capsys, cut_off(ride, tmp_path / "truncated.mcap", 0.6).path)
     assert status == 1
     assert len(errors.strip().splitlines()) == 1
-    assert 15 < lines[-1]["summary"]["recorded_seconds"] < 30
-    assert lines[-1]["summary"]["windows"]["used"] > 30
+    assert 25 < lines[-1]["summary"]["recorded_seconds"] < 45
+    assert lines[-1]["summary"]["windows"]["used"] > 50
 
 
-@pytest.mark.slow
 def test_the_same_ride_as_mcap_and_as_can_gives_the_same_estimates(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
+    ride: Ride, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The healthy recording, its values rounded as the CAN database does, written as CSV: MCAP against quantised."""
-    from sprung.replay.record import load_record
-
-    system = load_system()
-    record = load_record(shared("healthy-120s.mcap"), system.channels, system.sample_rate)
-    units = {"m/s^2": 0.002, "m/s": 2e-5, "m": 1e-6}
-    steps = np.array([0.0005 if c.name.startswith("car") else units[c.unit] for c in system.channels])
-    rounded = np.round(record.values / steps) * steps
-    file = tmp_path / "rounded.csv"
-    columns = ["time", *(c.name for c in system.channels)]
-    time = record.start / 1e9 + np.arange(len(rounded)) / system.sample_rate
-    np.savetxt(file, np.column_stack([time, rounded]), delimiter=",", header=",".join(columns), comments="", fmt="%.9f")
-    text = (Path(__file__).parents[1] / "model" / "systems" / "manchester.yaml").read_text()
-    named = tmp_path / "csv.yaml"
-    for channel in system.channels:
-        text = text.replace(f"can: {channel.can}", f"csv: {channel.name}")
-    named.write_text(text)
-    _, exact, _ = replay(capsys, shared("healthy-120s.mcap"))
-    _, quantised, _ = replay(capsys, file, "--system", named)
-    for a, b in zip(exact[-1]["summary"]["parameters"], quantised[-1]["summary"]["parameters"], strict=True):
+    """A CAN database rounds the values."""
+    vehicle = read_vehicle(MANCHESTER)
+    quantised = tmp_path / "ride.blf"
+    WRITERS["blf"](quantised, vehicle, ride.values, "")
+    (_, exact, _), (_, rounded, _) = (replay(capsys, path) for path in (ride.path, quantised))
+    for a, b in zip(exact[-1]["summary"]["parameters"], rounded[-1]["summary"]["parameters"], strict=True):
         assert abs(a["value"] - b["value"]) < 0.5 * a["std"]

@@ -10,6 +10,7 @@ from mcap.writer import CompressionType, Writer
 
 from sprung.model.signals import Channel
 from sprung.replay import UnreadableRecording, open_recording
+from sprung.replay.windowing import Windower
 from tests.replay_files import (
     CHANNELS,
     LEFT,
@@ -123,6 +124,18 @@ def test_an_empty_header_stamp_gives_way_to_the_publish_time(tmp_path: Path) -> 
     path = tmp_path / "a.mcap"
     write_ros2(path, stamped=False)
     assert np.array_equal(read(path)[1][0][0], TIMES)
+
+
+def test_header_stamps_are_even_where_messages_were_logged_in_bursts(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    write_ros2(path, bursts=30)
+    outcomes = {}
+    for source in ("auto", "log"):
+        recording = open_recording(path, CHANNELS, time_source=source)
+        windower = Windower(CHANNELS, 100.0, 100, 50)
+        outcomes[source] = {w.outcome for b in recording.blocks() for w in windower.push(b)}
+    assert outcomes["auto"] == {"used"}
+    assert "used" not in outcomes["log"]
 
 
 def test_json_values_that_are_no_numbers_are_missing(tmp_path: Path) -> None:
