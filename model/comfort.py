@@ -18,7 +18,7 @@ from scipy.signal import butter, freqs_zpk
 
 from sprung.model.ambient.response import Responses
 from sprung.model.ambient.sensing import sensing
-from sprung.model.schema import MotionSensor
+from sprung.model.schema import MotionSensor, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -213,9 +213,8 @@ def cost(system: System, log_ratio: FloatArray, baseline: FloatArray, speed: flo
 def _place(system: System, support: str) -> tuple[float, float]:
     """Where a support stands: its own position, or that of an element on it."""
     source = system.file.inputs[support]
-    own = getattr(source, "position", None)
-    if own is not None:
-        return (float(own[0]), float(own[1]))
+    if not isinstance(source, SupportInput) and source.position is not None:
+        return source.position
     for element in system.file.elements.values():
         if support in (element.upper, element.lower) and element.position is not None:
             return element.position

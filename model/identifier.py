@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from sprung.model.signals import Estimate, FloatArray
+from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 
 PRIOR_STD = 1.0  # of every log-ratio: nominal values are right within a factor e either way
 
@@ -37,4 +38,13 @@ class Identifies(Protocol):
         """One `Estimate` per window of (B, T, C), columns in the order of `System.channels`, NaN for absent sensors.
 
         start: log-ratios (B, P) to begin from.  Errors: `UnusableWindow`.
+        """
+
+    def examine(
+        self, windows: FloatArray, weigh: BoolArray, known: Sequence[tuple[MeasurementFault, ...]] = ()
+    ) -> list[Estimate]:
+        """As a tracker wants it: with evidence on gains, delays and wrong measurements, as far as it can be had.
+
+        weigh: windows (B,) whose evidence on gains and delays is wanted; known: faults that earlier windows had, for
+        each window.
         """

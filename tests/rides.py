@@ -21,7 +21,7 @@ LOST, FOREIGN = 0.02, 0.05  # of the messages
 
 
 @dataclass(frozen=True)
-class Ride:
+class RecordedRide:
     """A recording and the truth about it."""
 
     path: Path
@@ -31,7 +31,7 @@ class Ride:
     foreign: int = 0  # frames of other identifiers
 
 
-def make_ride(path: Path, seconds: float, seed: int) -> Ride:
+def make_ride(path: Path, seconds: float, seed: int) -> RecordedRide:
     """A healthy vehicle, in the format of the path's suffix."""
     vehicle = read_vehicle(MANCHESTER)
     (case,) = draw_cases(vehicle, 1, seed, ["clean"])
@@ -39,22 +39,22 @@ def make_ride(path: Path, seconds: float, seed: int) -> Ride:
     WRITERS[path.suffix[1:]](path, vehicle, made.values, VEHICLE)
     of = {"stiffness": case.stiffness, "damping": case.damping}
     truth = {f"{element}.{quantity}": v for quantity in of for element, v in of[quantity].items()}
-    return Ride(path, truth, made.values)
+    return RecordedRide(path, truth, made.values)
 
 
-def with_losses(ride: Ride, path: Path, seed: int = 1) -> Ride:
+def with_losses(ride: RecordedRide, path: Path, seed: int = 1) -> RecordedRide:
     """The same with a share of its messages gone, on a CAN bus with frames of others among them."""
     random = np.random.default_rng(seed)
     copy = _mcap_with_losses if path.suffix == ".mcap" else _can_with_losses
     lost, foreign = copy(ride.path, path, random)
-    return Ride(path, ride.truth, ride.values, lost, foreign)
+    return RecordedRide(path, ride.truth, ride.values, lost, foreign)
 
 
-def cut_off(ride: Ride, path: Path, share: float) -> Ride:
+def cut_off(ride: RecordedRide, path: Path, share: float) -> RecordedRide:
     """The first bytes of the file, as after a power failure."""
     whole = ride.path.read_bytes()
     path.write_bytes(whole[: round(share * len(whole))])
-    return Ride(path, ride.truth, ride.values)
+    return RecordedRide(path, ride.truth, ride.values)
 
 
 def _mcap_with_losses(source: Path, path: Path, random: np.random.Generator) -> tuple[int, int]:

@@ -11,7 +11,7 @@ from sprung.benchmarks.generator import read_vehicle
 from sprung.benchmarks.generator.files import WRITERS
 from sprung.model.system import MANCHESTER
 from sprung.service.cli import main
-from tests.rides import Ride, cut_off, make_ride, with_losses
+from tests.rides import RecordedRide, cut_off, make_ride, with_losses
 
 DRIFT = Path(__file__).parent / "data" / "drift-600s.blf"
 # What drifts in the bundled recording: parameter, share lost in the end, time constant (from 5 s before its start).
@@ -25,11 +25,11 @@ def replay(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int,
 
 
 @pytest.fixture(scope="module")
-def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+def ride(tmp_path_factory: pytest.TempPathFactory) -> RecordedRide:
     return make_ride(tmp_path_factory.mktemp("ride") / "healthy.mcap", 60.0, seed=5)
 
 
-def within(summary: dict[str, Any], ride: Ride) -> int:
+def within(summary: dict[str, Any], ride: RecordedRide) -> int:
     """Parameters of the 24 whose true value is less than three of their standard deviations off."""
     return sum(abs(p["value"] - ride.truth[p["name"]]) < 3 * p["std"] for p in summary["parameters"])
 
@@ -53,7 +53,7 @@ def test_the_bundled_recording_shows_two_parameters_drift_and_no_other(capsys: p
 
 
 def test_a_healthy_vehicle_is_measured_within_its_intervals_and_raises_no_alarm(
-    ride: Ride, capsys: pytest.CaptureFixture[str]
+    ride: RecordedRide, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, lines, _ = replay(capsys, ride.path)
     summary = lines[-1]["summary"]
@@ -78,7 +78,9 @@ def test_losses_are_counted_and_told_in_one_line(kind: str, tmp_path: Path, caps
     assert within(summary, ride) >= 22
 
 
-def test_a_truncated_file_is_used_up_to_its_end(ride: Ride, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_truncated_file_is_used_up_to_its_end(
+    ride: RecordedRide, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     status, lines, errors = replay(capsys, cut_off(ride, tmp_path / "truncated.mcap", 0.6).path)
     assert status == 1
     assert len(errors.strip().splitlines()) == 1
@@ -87,7 +89,7 @@ def test_a_truncated_file_is_used_up_to_its_end(ride: Ride, tmp_path: Path, caps
 
 
 def test_the_same_ride_as_mcap_and_as_can_gives_the_same_estimates(
-    ride: Ride, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ride: RecordedRide, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A CAN database rounds the values."""
     vehicle = read_vehicle(MANCHESTER)

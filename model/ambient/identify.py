@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -16,7 +18,7 @@ from sprung.model.ambient.transient import USUAL, TransientFit, TransientWindow
 from sprung.model.ambient.window import LOAD_STD, AmbientFit, WindowFit
 from sprung.model.identifier import PRIOR_STD, StageTimes, UnusableWindow
 from sprung.model.schema import Body
-from sprung.model.signals import BoolArray, Estimate, FloatArray
+from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System
 
 IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
@@ -41,14 +43,11 @@ class Forces:
         return ForceExcitation(self.inertia, found)
 
 
-class AmbientIdentifier:
-    """Identifies windows of a system on a track (column 0 is the speed where it is measured) or without inputs."""
+class _WindowByWindow(ABC):
+    """Identifies windows one after the other."""
 
     def __init__(self, system: System) -> None:
-        varying = {name: body for name, body in system.file.bodies.items() if body.load is not None}
         self.system, self.times = system, StageTimes()
-        self.window = WindowFit(system, list(varying), [_load_std(body) for body in varying.values()])
-        self.assumption: Assumption = Track(system, self.window) if system.on_track else Forces(system)
 
     @property
     def digest(self) -> str:
@@ -60,11 +59,31 @@ class AmbientIdentifier:
 
         states: ignored, since the excitation is unknown.  Errors: `UnusableWindow`.
         """
-        windows = self._checked(windows)
+        windows = checked(self.system, windows)
         begin = time.perf_counter()
         found = [self._estimate(values, None if start is None else start[b]) for b, values in enumerate(windows)]
         self.times = StageTimes(0.0, time.perf_counter() - begin)
         return found
+
+    def examine(
+        self, windows: FloatArray, weigh: BoolArray, known: Sequence[tuple[MeasurementFault, ...]] = ()
+    ) -> list[Estimate]:
+        """As `identify`: without measured inputs, sensors that are wrong are not told from forces."""
+        return self.identify(windows)
+
+    @abstractmethod
+    def _estimate(self, values: FloatArray, start: FloatArray | None) -> Estimate:
+        """Of one window (T, C)."""
+
+
+class AmbientIdentifier(_WindowByWindow):
+    """Identifies windows of a system on a track (column 0 is the speed where it is measured) or without inputs."""
+
+    def __init__(self, system: System) -> None:
+        super().__init__(system)
+        varying = {name: body for name, body in system.file.bodies.items() if body.load is not None}
+        self.window = WindowFit(system, list(varying), [_load_std(body) for body in varying.values()])
+        self.assumption: Assumption = Track(system, self.window) if system.on_track else Forces(system)
 
     def fit(self, values: FloatArray, start: FloatArray | None = None) -> AmbientFit | None:
         """The fit of one window (T, C); None if it is too quiet, too short or too slow."""
@@ -88,35 +107,16 @@ class AmbientIdentifier:
         P = len(self.system.parameters)
         return _silent(P, len(present)) if fit is None else as_estimate(fit, P, present)
 
-    def _checked(self, windows: FloatArray) -> FloatArray:
-        return checked(self.system, windows)
 
-
-class OutputOnlyIdentifier:
+class OutputOnlyIdentifier(_WindowByWindow):
     """Identifies windows of a structure without inputs, from free decay to steady ambient vibration.
 
     Where white forces do not explain a window, forces with a slope over frequency are tried.
     """
 
     def __init__(self, system: System) -> None:
-        self.system, self.times = system, StageTimes()
+        super().__init__(system)
         self.window, self.coloured = TransientWindow(system), AmbientIdentifier(system)
-
-    @property
-    def digest(self) -> str:
-        """Names the model that made an estimate."""
-        return self.system.digest
-
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
-        """One `Estimate` per window (B, T, C), NaN columns for absent sensors; see `model.identifier.Identifies`.
-
-        states: ignored, since the excitation is unknown.  Errors: `UnusableWindow`.
-        """
-        windows = checked(self.system, windows)
-        begin = time.perf_counter()
-        found = [self._estimate(values, None if start is None else start[b]) for b, values in enumerate(windows)]
-        self.times = StageTimes(0.0, time.perf_counter() - begin)
-        return found
 
     def _estimate(self, values: FloatArray, start: FloatArray | None) -> Estimate:
         present = np.asarray(np.isfinite(values).all(axis=0))

@@ -192,7 +192,7 @@ def _check_force(law: ElementLaw, values: tuple[float, ...], element: Element) -
 
 def _location(file: SystemFile, law: Law, location: str, partner: str | None) -> str:
     """The place with its partner, for laws that act between two."""
-    where = getattr(law, "where", "")
+    where = "body" if isinstance(law, BodyLaw) else law.where
     if where not in ("pair", "axle", "bodies"):
         if partner is not None:
             raise ValueError("with: this law acts at one place")

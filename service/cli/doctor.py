@@ -16,7 +16,7 @@ import can
 from packaging.requirements import Requirement
 
 from sprung import __version__
-from sprung.model.identification.identify import load_identifier, without_weights
+from sprung.model.identification.identify import Identifier, load_identifier, without_weights
 from sprung.model.system import load_system
 from sprung.replay.bus import opening_options, parse_bus
 from sprung.service.settings import Settings, settings_with
@@ -90,7 +90,7 @@ def _model(settings: Settings) -> Iterator[Check]:
     unused = without_weights(system) if settings.weights is not None else ""
     if unused:
         yield Check("warning", "model", f"{parameters}; the weights {settings.weights} are not used: {unused}")
-    elif getattr(identifier, "estimator", None) is None:
+    elif not isinstance(identifier, Identifier) or identifier.estimator is None:
         text = f"{system.name}, {parameters}; no trained estimator: identified from the nominal values, which is slower"
         yield Check("warning", "model", text)
     else:

@@ -87,8 +87,8 @@ def _bodies(system: System) -> Table:
     return table
 
 
-def _inertia(value: Any) -> str:
-    return "–" if value is None else f"{getattr(value, 'value', value):g} kg m²"
+def _inertia(value: float | None) -> str:
+    return "–" if value is None else f"{value:g} kg m²"
 
 
 def _elements(system: System) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,11 @@ _SCATTERED = 2654435761  # 2^32 over the golden ratio (Knuth): neighbours fall f
 log = logging.getLogger("sprung.engine")
 
 
+def in_this_process(system: System, identifier: Identifies) -> Identifies:
+    """Where the identifier of a vehicle's own model works, if the service has no process for it."""
+    return identifier
+
+
 @dataclass(frozen=True, slots=True)
 class Engine:
     """Everything that turns windows into tracked parameters."""
@@ -41,6 +46,7 @@ class Engine:
     tracker: Tracker
     dbc: Path | None = None
     weighed_of: int = WEIGHED_OF  # windows, one is weighed for gains, delays and loads
+    place: Callable[[System, Identifies], Identifies] = in_this_process  # identifiers of vehicles' own models
 
     @property
     def digest(self) -> str:
@@ -69,11 +75,11 @@ class Engine:
         starts: ns, of windows that will be tracked: measurements that are wrong are looked for, too.
         known: of each such window, `Tracker.hard_faults` of its vehicle, which spares looking for these anew.
         """
-        examine = getattr(self.identifier, "examine", None)  # not every identifier can
-        if starts is None or examine is None:
+        if starts is None:
             estimates = self.identifier.identify(values, states=states)
         else:
-            estimates = examine(values, np.array([self._weighed(start) for start in starts]), known)
+            weigh = np.array([self._weighed(start) for start in starts])
+            estimates = self.identifier.examine(values, weigh, known)
         times = self.identifier.times
         return estimates, {"estimate": times.estimate, "refine": times.refine}
 
@@ -81,6 +87,10 @@ class Engine:
         """Whether a window's evidence on gains and delays is computed: one of `weighed_of`."""
         number = start // round(self.tracker.settings.hop * 1e9)
         return bool(number * _SCATTERED % 2**32 < 2**32 // self.weighed_of)
+
+    def placed(self) -> Engine:
+        """The same, of a vehicle's own model, where the service identifies those."""
+        return replace(self, identifier=self.place(self.system, self.identifier))
 
     def load_state(self, data: dict[str, Any]) -> TrackerState:
         """A stored tracker state; one that cannot be read starts anew rather than stopping the service."""
@@ -133,15 +143,11 @@ def load_engine(settings: Settings) -> Engine:
 
 
 def engine_like(engine: Engine, system: System) -> Engine:
-    """An engine of another system file with the same measurements.
+    """An engine of another system file with the same measurements, which works in this process.
 
     Raises the model's one-line ValueErrors for a system whose windows cannot be identified.
     """
-    identifier = own_identifier(system)
-    apart = getattr(engine.identifier, "of_own_model", None)  # where the service identifies in processes of their own
-    if apart is not None:
-        identifier = apart(system, identifier)
-    return replace(engine, system=system, identifier=identifier, tracker=make_tracker(system))
+    return replace(engine, system=system, identifier=own_identifier(system), tracker=make_tracker(system))
 
 
 def own_identifier(system: System) -> Identifies:
@@ -156,16 +162,16 @@ def own_identifier(system: System) -> Identifies:
 
 
 def seconds_of_a_window(engine: Engine) -> float:
-    """Processor time that one simulated window takes to be identified; 0 for systems without measured inputs."""
+    """Processor time that one simulated window takes an engine that works in this process; 0 for systems without
+    measured inputs."""
     from sprung.model.identification.excitation import simulate_runs  # brings torch
 
     system = engine.system.whole_system
     if system.on_track or not system.file.inputs:
         return 0.0
     runs = simulate_runs(system, np.zeros((1, len(system.parameters))), system.window, np.random.default_rng(0))
-    here = getattr(engine.identifier, "here", engine.identifier)  # processor time of this thread is what is measured
     begin = time.thread_time()
-    replace(engine, identifier=here).identify(runs.values, starts=[0])
+    engine.identify(runs.values, starts=[0])
     return time.thread_time() - begin
 
 

@@ -131,6 +131,10 @@ class Engines:
 
     def made(self, text: str, what: str) -> Engine:
         """The engine of a system file's text.  Raises UserError where it is not one of the same measurements."""
+        return self._made(text, what).placed()
+
+    def _made(self, text: str, what: str) -> Engine:
+        """As `made`, in this process."""
         shared = self.shared.engine.system
         try:
             self._not_too_large(parse_system_file(text, what), what)
@@ -152,13 +156,13 @@ class Engines:
 
         Raises UserError also where that takes too long.
         """
-        engine = self.made(text, what)
+        engine = self._made(text, what)
         seconds = seconds_of_a_window(engine)
         if seconds > OWN_SECONDS:
             raise UserError(
                 f"{what}: a window takes longer than {OWN_SECONDS:g} s of processor time; leave laws or bodies out"
             )
-        return engine
+        return engine.placed()
 
     def _not_too_large(self, file: SystemFile, what: str) -> None:
         """Before anything is calculated, which takes the cube of a system's size."""

@@ -11,7 +11,7 @@ from typing import Any
 from sprung.model.identifier import Identifies, StageTimes
 from sprung.model.laws import Law
 from sprung.model.schema import SystemFile
-from sprung.model.signals import Estimate, FloatArray
+from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System
 from sprung.service.monitoring.engine import one_thread_an_operation, own_identifier
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
@@ -23,34 +23,28 @@ NICE = 10  # of that process: where processors are scarce, the windows of all ot
 class IdentifierApart:
     """An identifier in a process of its own; in this one from when that has ended."""
 
-    def __init__(self, here: Identifies, ask: Callable[..., Any], own_models: ForkedFunctions | None = None) -> None:
-        """ask: as `_asked`, in the process; own_models: the process for vehicles with models of their own."""
+    def __init__(self, here: Identifies, ask: Callable[..., Any]) -> None:
+        """ask: as `_asked`, in the process."""
         self.digest = here.digest
         self.times = StageTimes()
-        self.here = here
+        self._here = here
         self._ask_there = ask
-        self._own_models = own_models
 
     def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
         """As that of the identifier."""
         return self._ask("identify", windows, start, states=states)
 
-    @property
-    def examine(self) -> Callable[..., list[Estimate]] | None:
-        """That of the identifier, where it has one."""
-        return partial(self._ask, "examine") if hasattr(self.here, "examine") else None
-
-    def of_own_model(self, system: System, here: Identifies) -> Identifies:
-        """That of a vehicle's own model, apart as well: its windows may take seconds each."""
-        if self._own_models is None:
-            return here
-        return IdentifierApart(here, partial(self._own_models.call, "ask", here.digest, system.file))
+    def examine(
+        self, windows: FloatArray, weigh: BoolArray, known: Sequence[tuple[MeasurementFault, ...]] = ()
+    ) -> list[Estimate]:
+        """As that of the identifier."""
+        return self._ask("examine", windows, weigh, known)
 
     def _ask(self, what: str, *given: Any, **named: Any) -> list[Estimate]:
         try:
             found, self.times = self._ask_there(what, *given, **named)
         except ProcessEnded:
-            found, self.times = _asked(self.here, what, *given, **named)
+            found, self.times = _asked(self._here, what, *given, **named)
         return list(found)
 
 
@@ -64,6 +58,14 @@ def identifying_processes(identifier: Identifies, catalogue: Sequence[Law]) -> t
         ForkedFunctions("identifies windows", shared, one_thread_an_operation),
         ForkedFunctions("identifies windows with vehicles' own models", own, _begin_behind),
     )
+
+
+def placed_in(process: ForkedFunctions) -> Callable[[System, Identifies], Identifies]:
+    """`Engine.place`: where windows of vehicles with models of their own, which may take seconds each, are identified.
+
+    process: the second one of `identifying_processes`.
+    """
+    return lambda system, here: IdentifierApart(here, partial(process.call, "ask", here.digest, system.file))
 
 
 def _begin_behind() -> None:

@@ -9,7 +9,7 @@ from functools import partial
 
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.following import Following, FollowingApart, follow
-from sprung.service.monitoring.identifying import IdentifierApart, identifying_processes
+from sprung.service.monitoring.identifying import IdentifierApart, identifying_processes, placed_in
 from sprung.service.processes.forked import forks
 from sprung.service.settings import Settings
 
@@ -31,5 +31,5 @@ def numerics(engine: Engine, settings: Settings) -> Iterator[tuple[Engine, Follo
         shared, own = identifying_processes(engine.identifier, engine.system.catalogue)
         stack.callback(shared.close)
         stack.callback(own.close)
-        identifier = IdentifierApart(engine.identifier, partial(shared.call, "ask"), own)
-        yield replace(engine, identifier=identifier), following
+        identifier = IdentifierApart(engine.identifier, partial(shared.call, "ask"))
+        yield replace(engine, identifier=identifier, place=placed_in(own)), following

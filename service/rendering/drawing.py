@@ -12,7 +12,7 @@ from html import escape
 
 import numpy as np
 
-from sprung.model.schema import ForceInput
+from sprung.model.schema import ForceInput, MotionSensor
 from sprung.model.system import System
 from sprung.service.monitoring.views import LETTERS
 from sprung.service.report.layout import Layout, lay_out
@@ -114,10 +114,9 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
     parts += _captions(system, foot, tops)
     names = short_names(system.sensors)
     for name, sensor in file.sensors.items():
-        body = getattr(sensor, "body", None)
-        if body in tops:
-            at = getattr(sensor, "position", None)
-            x, y = at if at is not None else file.bodies[body].position
+        if isinstance(sensor, MotionSensor):
+            body = sensor.body
+            x, y = sensor.position or file.bodies[body].position
             across = found.across(float(x), float(y))
             stands = any(
                 base == tops[body] and found.across(*layout.element_position(element)) == across
@@ -126,10 +125,8 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
             across += found.column / 2 if stands else 0.0  # beside the element that stands there
             parts.append(_sensor(name, names[name], across, tops[body], sensors))
         else:
-            element = getattr(sensor, "element", None)
-            if element in file.elements:
-                across = found.across(*layout.element_position(element)) + found.column / 2
-                parts.append(_sensor(name, names[name], across, sum(spans[element]) / 2, sensors))
+            across = found.across(*layout.element_position(sensor.element)) + found.column / 2
+            parts.append(_sensor(name, names[name], across, sum(spans[sensor.element]) / 2, sensors))
     return "".join([*parts, "</svg>"])
 
 

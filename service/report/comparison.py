@@ -7,6 +7,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from scipy import signal
 
+from sprung.model.schema import ElementSensor
 from sprung.model.signals import FloatArray
 from sprung.service.report import ink
 from sprung.service.report.recordings import Comparison
@@ -74,7 +75,7 @@ def loops_figure(found: Comparison) -> Figure | None:
 
 def _measured_force(found: Comparison, element: str) -> FloatArray | None:
     for i, (_, sensor) in enumerate(found.system.file.sensors.items()):
-        if sensor.kind == "force" and getattr(sensor, "element", None) == element:
+        if isinstance(sensor, ElementSensor) and sensor.kind == "force" and sensor.element == element:
             measured: FloatArray = found.measured[:, i]
             return measured
     return None

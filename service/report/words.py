@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from sprung.model.diagnosis.report.report import Finding, LawParameter, Report
-from sprung.model.laws import CATALOGUE, Law
+from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.basis import UNKNOWN
 from sprung.service.report.ink import engineering
 from sprung.service.report.values import largest_bias
@@ -36,8 +36,8 @@ def _called(effect: str, laws: Laws) -> Law | None:
 def _minor(effect: str, laws: Laws) -> set[str]:
     """Parameters of a law, or of its wider form, that say nothing about how strong it is."""
     law = _called(effect, laws)
-    forms = [form for form in (law, getattr(law, "wider", None)) if form is not None]
-    return {spec.name for form in forms for spec in form.parameters if spec.minor}
+    forms = [law, law.wider] if isinstance(law, ElementLaw) else [law]
+    return {spec.name for form in forms if form is not None for spec in form.parameters if spec.minor}
 
 
 def quantity(p: LawParameter) -> str:

@@ -44,6 +44,15 @@ class Source(Protocol):
     """A live bus."""
 
     name: str
+    connected: bool
+    lost: int  # frames dropped by the kernel
+    lag: float  # s that the last frame had waited
+    reconnects: int
+    beat: float  # monotonic s, when its reader last came by; one that hangs does not
+
+    @property
+    def trouble(self) -> str:
+        """Why it is not connected; empty while it is."""
 
     @property
     def tally(self) -> Tally:
@@ -115,8 +124,7 @@ class LiveFeed:
 
     def start(self) -> None:
         """Begin."""
-        if hasattr(self.source, "beat"):  # it may have been made long ago
-            self.source.beat = time.monotonic()
+        self.source.beat = time.monotonic()  # it may have been made long ago
         for thread in (self._reading, self._keeping, self._watching):
             thread.start()
 
@@ -137,12 +145,12 @@ class LiveFeed:
             self.vehicle,
             state,
             detail,
-            round(float(getattr(self.source, "lag", 0.0)), 3),
+            round(self.source.lag, 3),
             len(self._waiting),
             self._dropped,
             self._failed,
-            int(getattr(self.source, "lost", 0)),
-            self._restarts + int(getattr(self.source, "reconnects", 0)),
+            self.source.lost,
+            self._restarts + self.source.reconnects,
         )
 
     def _state(self, now: float) -> tuple[str, str]:
@@ -156,12 +164,12 @@ class LiveFeed:
             return "down", self._trouble
         if self._ended:
             return "ended", "the source has ended"
-        if not getattr(self.source, "connected", True):
-            return "down", getattr(self.source, "trouble", "") or "the bus is not open yet"
+        if not self.source.connected:
+            return "down", self.source.trouble or "the bus is not open yet"
         if now - self._dropped_at < LATELY_SECONDS:
             return "behind", f"{self._dropped} windows were given up since the start"
-        if getattr(self.source, "lag", 0.0) > BEHIND_SECONDS:
-            return "behind", f"frames wait {self.source.lag:.0f} s"  # type: ignore[attr-defined]
+        if self.source.lag > BEHIND_SECONDS:
+            return "behind", f"frames wait {self.source.lag:.0f} s"
         if now - self._last_block > SILENT_SECONDS:
             return "silent", "no frame that the system file names has come lately"
         return "receiving", ""
@@ -265,7 +273,7 @@ class LiveFeed:
             self._restarts += 1
             self._keeping = self._thread(self._keep)
             self._keeping.start()
-        beat = getattr(self.source, "beat", time.monotonic())
+        beat = self.source.beat
         if self._ended or (self._reading.is_alive() and time.monotonic() - beat < HUNG_SECONDS):
             self._hung = self._hung and beat <= self._begun  # until the one that was started gives a sign
             return
@@ -274,8 +282,7 @@ class LiveFeed:
         self._hung = True
         self._turn += 1
         self._begun = time.monotonic()
-        if hasattr(self.source, "beat"):
-            self.source.beat = self._begun
+        self.source.beat = self._begun
         self._reading = self._thread(self._read)
         self._reading.start()
 

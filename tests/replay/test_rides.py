@@ -12,7 +12,7 @@ from sprung.replay import open_recording
 from sprung.replay.record import load_record
 from sprung.replay.recording import Recording
 from sprung.replay.windowing import Windower
-from tests.rides import MESSAGES, VEHICLE, Ride, cut_off, make_ride, with_losses
+from tests.rides import MESSAGES, VEHICLE, RecordedRide, cut_off, make_ride, with_losses
 
 DRIFT = Path(__file__).parents[1] / "data" / "drift-600s.blf"
 START = 1_790_000_000_000_000_000
@@ -27,11 +27,11 @@ def windows_of(path: Path, system: System) -> tuple[Recording, Windower, list[Wi
 
 
 @pytest.fixture(scope="module")
-def ride(tmp_path_factory: pytest.TempPathFactory) -> Ride:
+def ride(tmp_path_factory: pytest.TempPathFactory) -> RecordedRide:
     return make_ride(tmp_path_factory.mktemp("ride") / "whole.mcap", SECONDS, seed=3)
 
 
-def in_order(ride: Ride, system: System) -> FloatArray:
+def in_order(ride: RecordedRide, system: System) -> FloatArray:
     """The true samples, in the order of the system's channels."""
     inputs = ride.values[:, :16].reshape(-1, 2, 8).swapaxes(1, 2).reshape(-1, 16)
     assert system.channels[1].name.endswith("velocity")
@@ -76,7 +76,7 @@ def test_every_lost_message_is_counted(kind: str, tmp_path: Path, system: System
     assert repaired > 1.5 * windower.account.lost  # each lies in two windows, but for dropped ones
 
 
-def test_repaired_samples_are_close_to_the_lost_ones(ride: Ride, tmp_path: Path, system: System) -> None:
+def test_repaired_samples_are_close_to_the_lost_ones(ride: RecordedRide, tmp_path: Path, system: System) -> None:
     lossy = with_losses(ride, tmp_path / "lossy.mcap")
     came = load_record(lossy.path, system.channels, 100.0)
     truth = in_order(ride, system)
@@ -95,7 +95,7 @@ def test_repaired_samples_are_close_to_the_lost_ones(ride: Ride, tmp_path: Path,
     assert np.sqrt(np.nanmean(error**2)) < 0.2
 
 
-def test_a_recording_that_was_cut_off_is_read_to_the_cut(ride: Ride, tmp_path: Path, system: System) -> None:
+def test_a_recording_that_was_cut_off_is_read_to_the_cut(ride: RecordedRide, tmp_path: Path, system: System) -> None:
     recording, _, windows = windows_of(cut_off(ride, tmp_path / "cut.mcap", 0.64).path, system)
     assert 0.55 < recording.tally.used / (100 * SECONDS * MESSAGES) < 0.75
     assert recording.incomplete

@@ -52,7 +52,7 @@ class Wiring:
         self.system, self.signals = system, signals
         listed = list(system.file.sensors.values())
         self.sensors = [listed[int(i)] for i in signals.sensor_index]
-        self.body = [getattr(sensor, "body", None) for sensor in self.sensors]
+        self.body = [sensor.body if isinstance(sensor, MotionSensor) else None for sensor in self.sensors]
         self.kind = [sensor.kind for sensor in self.sensors]
         self.carries: dict[str, list[int]] = {body: [] for body in system.bodies}  # supports right below a body
         self.place: dict[int, tuple[float, float]] = {}

@@ -112,10 +112,14 @@ def given_terms(system: System) -> tuple[Term, ...]:
             variant = law.variants(system.mechanics, system.bodies.index(placed.location))[0]
         elif isinstance(law, StructureLaw) and not variant:
             variant = law.variants[0]
-        elif isinstance(law, ElementLaw) and any(getattr(other, "wider", None) is law for other in system.catalogue):
+        elif isinstance(law, ElementLaw) and law in _wider_forms(system):
             variant = WIDER
         found.append(Term(law, placed.location, placed.values, variant, scales=scales, fixed=placed.fixed))
     return tuple(found)
+
+
+def _wider_forms(system: System) -> list[ElementLaw]:
+    return [law.wider for law in system.catalogue if isinstance(law, ElementLaw) and law.wider is not None]
 
 
 def supports(system: System) -> list[str]:

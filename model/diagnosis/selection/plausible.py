@@ -134,8 +134,9 @@ def _unresolved(fit: Fit, term: Term, rules: PlausibleRules) -> str | None:
 
 def harmonic(part: Part, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
     """A periodic force or movement at a multiple of one of the excitation's own frequencies."""
-    names = term.law.names
-    if "frequency" not in names or not (isinstance(term.law, SupportLaw) or getattr(term.law, "load", None)):
+    law, names = term.law, term.law.names
+    drives = isinstance(law, SupportLaw) or (isinstance(law, BodyLaw) and law.load is not None)
+    if "frequency" not in names or not drives:
         return None
     frequency = term.parameters[names.index("frequency")]
     for line in excitation_lines(part, rules):

@@ -26,7 +26,7 @@ from sprung.model.system import MANCHESTER, System, parse_system
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine, engine_like, one_thread_an_operation, seconds_of_a_window
 from sprung.service.monitoring.following import FollowingApart, follow
-from sprung.service.monitoring.identifying import IdentifierApart, identifying_processes
+from sprung.service.monitoring.identifying import IdentifierApart, identifying_processes, placed_in
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import WindowsToFold
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
@@ -170,7 +170,7 @@ def test_calls_of_several_threads_get_their_own_answers(doubling: ForkedFunction
 
 def test_an_identifier_apart_answers_as_it_does_here(engine: Engine, system: System) -> None:
     shared, own = identifying_processes(engine.identifier, system.catalogue)
-    apart = IdentifierApart(engine.identifier, partial(shared.call, "ask"), own)
+    apart = IdentifierApart(engine.identifier, partial(shared.call, "ask"))
     values = np.stack([make_window(system, n).values for n in range(3)])
     with closing(shared), closing(own):
         there = replace(engine, identifier=apart)
@@ -183,15 +183,15 @@ def test_an_identifier_apart_answers_as_it_does_here(engine: Engine, system: Sys
                 np.testing.assert_array_equal(one.covariance, other.covariance)
             if shared.pid is not None:
                 os.kill(shared.pid, signal.SIGKILL)
-        assert (apart.examine is None) == (not hasattr(engine.identifier, "examine"))
 
 
 def test_a_vehicles_own_model_is_identified_apart_and_behind_the_others(engine: Engine, system: System) -> None:
     shared, own = identifying_processes(engine.identifier, system.catalogue)
     with closing(shared), closing(own):
-        served = replace(engine, identifier=IdentifierApart(engine.identifier, partial(shared.call, "ask"), own))
+        served = replace(engine, place=placed_in(own))
         other = parse_system(MANCHESTER.read_text().replace("mass: 32000", "mass: 33000"))
-        there, here = engine_like(served, other), engine_like(engine, other)
+        here = engine_like(served, other)
+        there = here.placed()
         assert isinstance(there.identifier, IdentifierApart) and there.digest == here.digest != engine.digest
         assert shared.pid is not None and own.pid is not None
         assert os.getpriority(os.PRIO_PROCESS, own.pid) > os.getpriority(os.PRIO_PROCESS, shared.pid)
@@ -204,7 +204,7 @@ def test_a_vehicles_own_model_is_identified_apart_and_behind_the_others(engine: 
         for one, another in zip(wanted, found, strict=True):
             np.testing.assert_array_equal(one.log_ratio, another.log_ratio)
         assert taken < time.thread_time() - begun - taken
-        assert seconds_of_a_window(there) > 0.0  # measured here, where processor time can be
+        assert seconds_of_a_window(here) > 0.0
 
 
 @pytest.mark.parametrize("vehicles", [1, 10])

@@ -31,20 +31,23 @@ from tests.service_fakes import START, FakeIdentifier, eventually
 
 
 class RowSource:
-    """Rows of all channels, a hundred a recorded second, as quickly as `pace` allows; does what `trouble` says."""
+    """Rows of all channels, a hundred a recorded second, as quickly as `pace` allows; does what `happens` says."""
 
     def __init__(self, channels: int, pace: float = 0.0) -> None:
         self.name = "test:0"
         self.tally = Tally()
         self.row = 0
-        self.trouble: Callable[[], None] = lambda: None
+        self.happens: Callable[[], None] = lambda: None
+        self.connected, self.trouble = True, ""
+        self.lost = self.reconnects = 0
+        self.lag, self.beat = 0.0, time.monotonic()
         self._channels = channels
         self._pace = pace
 
     def blocks(self) -> Iterator[SampleBlock]:
         rows = 10
         while True:
-            self.trouble()
+            self.happens()
             numbers = np.arange(self.row, self.row + rows)
             times = np.repeat(START + numbers * 10_000_000, self._channels)
             self.row += rows
@@ -121,14 +124,14 @@ def test_readiness_tells_of_a_feed_that_does_not_work(core: Core, feed: LiveFeed
     def broken() -> None:
         raise RuntimeError("the decoder stumbled")
 
-    source.trouble = broken
+    source.happens = broken
     with TestClient(create_app(core, on_start=feed.start, on_stop=lambda: None)) as client:
         eventually(lambda: feed.status().state == "down")
         answer = client.get("/health/ready")
         assert answer.status_code == 503
         assert "feed test:0 is down: the decoder stumbled; trying again" in answer.json()["detail"]
         assert client.get("/health/live").status_code == 200
-        source.trouble = lambda: None
+        source.happens = lambda: None
         eventually(lambda: client.get("/health/ready").status_code == 200)
         assert client.get("/health/ready").json()["feeds"][0]["restarts"] > 0
 
@@ -206,14 +209,14 @@ def test_a_reader_that_hangs_is_replaced(
     release, hung = threading.Event(), threading.Event()
 
     def hang() -> None:
-        source.trouble = beat
+        source.happens = beat
         hung.set()
         release.wait(20)
 
     def beat() -> None:
-        source.beat = time.monotonic()  # type: ignore[attr-defined]
+        source.beat = time.monotonic()
 
-    source.trouble = hang
+    source.happens = hang
     beat()
     feed.start()
     assert hung.wait(5)
