@@ -1,4 +1,5 @@
-"""Invisible and control characters in names, which are deceptive on terminals, in logs and on pages."""
+"""Text for terminals: counted things, and names without the invisible and control characters that deceive there, in
+logs and on pages."""
 
 from __future__ import annotations
 
@@ -40,3 +41,12 @@ def one_line(text: str, longest: int | None = None) -> str:
     given = text if longest is None else text[: 4 * longest]
     line = " ".join("".join(sign if sign.isprintable() else " " for sign in given).split())
     return line if longest is None or len(line) <= longest else f"{line[:longest]} ..."
+
+
+def counted(number: int, one: str, several: str = "") -> str:
+    """A number of things; several: their plural, where it is not `one` with an s.
+
+    >>> counted(1, "body", "bodies"), counted(0, "sensor")
+    ('1 body', '0 sensors')
+    """
+    return f"{number} {one if number == 1 else several or one + 's'}"

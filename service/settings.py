@@ -6,16 +6,17 @@ Environment variables `SPRUNG_<NAME>` set the defaults of the command line's opt
 from __future__ import annotations
 
 import ipaddress
+import json
 import logging
 import os
 import sys
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, SecretStr, ValidationError, field_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import BeforeValidator, Field, SecretStr, ValidationError, field_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from sprung.service.errors import UserError
 
@@ -33,6 +34,17 @@ def default_data_dir() -> Path:
     else:
         base = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
     return base / "sprung"
+
+
+def _listed(given: Any) -> Any:
+    """Text as its parts."""
+    if not isinstance(given, str):
+        return given
+    return json.loads(given) if given.lstrip().startswith("[") else given.replace(",", " ").split()
+
+
+# Separated by commas or spaces, or a JSON list
+Listed = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)]
 
 
 class Settings(BaseSettings):
@@ -60,10 +72,8 @@ class Settings(BaseSettings):
     oidc_claim: str = "groups"  # where tokens name groups, as in realm_access.roles
     oidc_groups: dict[str, list[str]] = {}  # scopes by group, as JSON: {"maintenance": ["operate", "fleet:north-"]}
     oidc_session_hours: float = Field(default=8.0, gt=0, le=24)  # before people sign in again
-    allowed_hosts: tuple[
-        str, ...
-    ] = ()  # host names that are served, as a JSON list; none: any, where tokens are needed
-    trusted_proxies: tuple[str, ...] = ()  # addresses or networks, as a JSON list, whose X-Forwarded-* are believed
+    allowed_hosts: Listed = ()  # host names that are served; none: any, where tokens are needed
+    trusted_proxies: Listed = ()  # addresses or networks whose X-Forwarded-* are believed
     log_format: Literal["text", "json"] = "text"
     log_level: Literal["debug", "info", "warning", "error"] = "warning"
     connections: int = Field(default=1000, gt=0)  # in all; fewer where the system allows fewer open files
@@ -100,10 +110,10 @@ class Settings(BaseSettings):
     silent_seconds: float = Field(default=600.0, gt=0)  # nothing heard for so long: the vehicle is shown as silent
 
     public_url: str = ""  # where people reach the pages, as in https://sprung.example.org; for links in notifications
-    webhooks: str = ""  # URLs that events are posted to, separated by spaces
-    webhook_networks: str = ""  # that receivers may lie in beside public addresses, as in 10.0.0.0/8 127.0.0.0/8
+    webhooks: Listed = ()  # URLs that events are posted to
+    webhook_networks: Listed = ()  # that receivers may lie in beside public addresses, as in 10.0.0.0/8,127.0.0.0/8
     webhook_secret: str | None = None  # signs them (Standard Webhooks); whsec_... or any text
-    mail_to: str = ""  # addresses that events are mailed to, separated by spaces
+    mail_to: Listed = ()  # addresses that events are mailed to
     mail_from: str = "sprung@localhost"
     smtp_host: str = ""
     smtp_port: int = Field(default=25, ge=1, le=65535)

@@ -11,7 +11,7 @@ import ipaddress
 import socket
 import ssl
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from urllib.parse import urlsplit
@@ -39,10 +39,10 @@ class Receiver:
     target: str  # path and query
 
 
-def networks(text: str) -> tuple[Network, ...]:
-    """Networks as 10.0.0.0/8 fd00::/8, separated by spaces or commas.  Raises UserError."""
+def networks(given: Iterable[str]) -> tuple[Network, ...]:
+    """Networks as 10.0.0.0/8 or fd00::/8.  Raises UserError."""
     try:
-        return tuple(ipaddress.ip_network(part) for part in text.replace(",", " ").split())
+        return tuple(ipaddress.ip_network(one) for one in given)
     except ValueError as error:
         raise UserError(f"setting webhook_networks ({SETTING}): {error}") from None
 

@@ -77,7 +77,7 @@ def replay(
     start: Start = None,
     json_lines: Json = False,
 ) -> int:
-    """Recordings -> windows -> estimates -> drift.
+    """Identify recordings window by window, and track.
 
     Without --store nothing is kept: every run then depends on its files alone.
     """
@@ -128,7 +128,10 @@ def serve(
     ] = None,
     vehicle: Vehicle = None,
 ) -> int:
-    """REST, metrics and pages, on an embedded store unless --store says otherwise."""
+    """Run the service: API, metrics and pages.
+
+    On an embedded store unless --store says otherwise.
+    """
     one_thread_each()
     from sprung.service.cli.serve import run
 
@@ -162,7 +165,10 @@ def train(
     ] = None,
     steps: Annotated[int | None, typer.Option("--steps", metavar="NUMBER", min=1, help="Optimiser steps.")] = None,
 ) -> int:
-    """Train the estimator for a system (optional: it saves time, not accuracy); goes on after an interrupt."""
+    """Train the estimator for a system (optional).
+
+    It saves time, not accuracy; training goes on after an interrupt.
+    """
     from sprung.service.cli.train import run
 
     return run(
@@ -195,7 +201,10 @@ def diagnose(
     ] = None,
     json_lines: Json = False,
 ) -> int:
-    """What the model leaves out: where, which law, how much better the simulation fits with it."""
+    """Find unmodelled dynamics: where, which law, how much.
+
+    The report says how much better the simulation fits with it.
+    """
     one_thread_each()  # candidates are fitted beside each other
     hand_over_often()
     from sprung.service.cli.diagnose import DiagnoseOptions, run
@@ -217,7 +226,10 @@ def simulate(
     ] = False,
     seed: Annotated[int, typer.Option("--seed", metavar="NUMBER", help="Seed of the noise.")] = 0,
 ) -> int:
-    """Write what the sensors of a vehicle with the laws of its system file would measure."""
+    """Simulate a vehicle's sensors, and write a recording.
+
+    With the laws of its system file.
+    """
     from sprung.service.cli.simulate import simulate as run
 
     return run(system_file, inputs, out, dbc, settings or [], noise, seed)
@@ -236,7 +248,10 @@ def compare(
     ] = None,
     json_lines: Json = False,
 ) -> int:
-    """How far a simulation is from a recording: errors of every sensor, residual spectra, force loops."""
+    """Compare a simulation with a recording.
+
+    Errors of every sensor, residual spectra, force loops.
+    """
     from sprung.service.cli.simulate import show as run
 
     return run(measured, other, system, dbc, out, json_lines)
@@ -257,7 +272,10 @@ def experiment(
     ] = None,
     json_lines: Json = False,
 ) -> int:
-    """Which run would distinguish look-alikes best, with the expected evidence."""
+    """Find the run that distinguishes look-alikes best.
+
+    With the evidence that is expected of it.
+    """
     from sprung.service.cli.experiment import run
 
     return run(models, system, menu, known, json_lines)
@@ -276,7 +294,10 @@ def inspect(
     ] = None,
     json_lines: Json = False,
 ) -> int:
-    """What a recording holds: signals, rates, units, gaps, ranges, spectra."""
+    """Show what a recording holds.
+
+    Signals, rates, units, gaps, ranges, spectra.
+    """
     from sprung.service.cli.inspect import run
 
     return run(
@@ -305,7 +326,10 @@ def system(
         ),
     ] = None,
 ) -> int:
-    """Check a system file; print bodies, elements, modes, and what the sensors can identify; or export the model."""
+    """Check a system file; show or export its model.
+
+    Bodies, elements, modes, and what the sensors can identify.
+    """
     from sprung.service.cli.system import run
 
     return run(file, json_lines, schema, export)
@@ -326,7 +350,10 @@ def import_model(
     ] = None,
     name: Annotated[str | None, typer.Option("--name", help="Name of the system; default: the file's.")] = None,
 ) -> int:
-    """A system file from a linear model's matrices: a baseline for identification and diagnosis."""
+    """Make a system file from a linear model's matrices.
+
+    A baseline for identification and diagnosis.
+    """
     from sprung.service.cli.system import import_matrices
 
     return import_matrices(file, out, rate, name)
@@ -352,7 +379,10 @@ def export(
     store: StoreUrl = None,
     weights: Weights = None,
 ) -> int:
-    """The history of a vehicle's parameters as a file, out of a store."""
+    """Write the history of a vehicle's parameters to a file.
+
+    Out of a store.
+    """
     one_thread_each()
     from sprung.service.cli.history import run
 
@@ -380,7 +410,10 @@ def doctor(
         list[str] | None, typer.Option("--can", metavar="INTERFACE:CHANNEL", help="Listen to this bus; repeatable.")
     ] = None,
 ) -> int:
-    """Check installation, model, store, disk, clock and buses; a line each, and what to do."""
+    """Check the installation; a line each, and what to do.
+
+    Packages, model, store, disk, clock and buses.
+    """
     one_thread_each()
     from sprung.service.cli.doctor import run
 
@@ -392,7 +425,10 @@ def bench(
     context: typer.Context,
     name: Annotated[str | None, typer.Argument(help="Without a name, all benchmarks are listed.")] = None,
 ) -> int:
-    """A benchmark, one JSON line per figure; further arguments go to it (--budget full, --data DIR)."""
+    """Run a benchmark: one JSON line per figure.
+
+    Further arguments go to it (--budget full, --data DIR).
+    """
     one_thread_each()  # as the commands that it measures do; before anything numerical is loaded
     from sprung.service.cli.bench import run
 

@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 from sprung import __version__
 from sprung.model.identification.identify import Identifier, load_identifier, without_weights
 from sprung.model.system import load_system
+from sprung.model.text import counted
 from sprung.replay.bus import opening_options, parse_bus
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
@@ -86,7 +87,7 @@ def _installation(_settings: Settings) -> Iterator[Check]:
 def _model(settings: Settings) -> Iterator[Check]:
     system = load_system(settings.system) if settings.system is not None else load_system()
     identifier = load_identifier(system, settings.weights)
-    parameters = f"{len(system.parameters)} parameters"
+    parameters = counted(len(system.parameters), "parameter")
     unused = without_weights(system) if settings.weights is not None else ""
     if unused:
         yield Check("warning", "model", f"{parameters}; the weights {settings.weights} are not used: {unused}")
@@ -111,7 +112,7 @@ def _store(settings: Settings) -> Iterator[Check]:
             pass
     finally:
         store.close()
-    yield Check("ok", "store", f"{settings.store_url}, {vehicles} vehicles, can be written")
+    yield Check("ok", "store", f"{settings.store_url}, {counted(vehicles, 'vehicle')}, can be written")
 
 
 def _disk(settings: Settings) -> Iterator[Check]:

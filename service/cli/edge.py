@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from sprung.model.text import counted
 from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
@@ -145,7 +146,7 @@ def _line(summary: dict[str, Any]) -> str:
     left = f"; some wait in the spool: {summary['waiting']}" if summary["waiting"] else ""
     made = summary["messages"] + summary["recordings"]
     return (
-        f"{summary['vehicle']}: {summary['windows']} windows, {summary['sent']} of {made} messages sent, "
+        f"{summary['vehicle']}: {counted(summary['windows'], 'window')}, {summary['sent']} of {made} messages sent, "
         f"{summary['estimate_bytes_per_second'] or 0:.0f} B/s of estimates, "
         f"{summary['raw_bytes'] / 1e3:.0f} kB of raw samples, {100 * (summary['cpu_share'] or 0):.1f} % of a core{left}"
     )

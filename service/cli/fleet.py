@@ -15,6 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sprung.model.text import counted
 from sprung.service.access.tokens import Tokens
 from sprung.service.api import ray_serving
 from sprung.service.api.ray_serving import ServingSizes
@@ -66,7 +67,7 @@ def run_backfill(
             print(json.dumps(summary), flush=True)
         else:
             known = f", {file.known} known from another recording" if file.known else ""
-            said = "done before" if file.before else file.problem or f"{file.windows} windows{known}"
+            said = "done before" if file.before else file.problem or f"{counted(file.windows, 'window')}{known}"
             print(f"{done}/{of} {file.file.path} ({file.file.vehicle}): {said}", flush=True)
 
     tasks = tasks_for(_on(on), workers)
@@ -83,8 +84,9 @@ def run_backfill(
         for problem in summary.problems:
             print(f"sprung: {problem}", file=sys.stderr)
         print(
-            f"{summary.files} files, {summary.done_before} of them done before; {summary.windows} windows of "
-            f"{len(summary.vehicles)} vehicles in {seconds:.0f} s on {tasks.name}; {len(summary.problems)} problems"
+            f"{counted(summary.files, 'file')}, {summary.done_before} of them done before; "
+            f"{counted(summary.windows, 'window')} of {counted(len(summary.vehicles), 'vehicle')} "
+            f"in {seconds:.0f} s on {tasks.name}; {counted(len(summary.problems), 'problem')}"
         )
     return 1 if summary.problems else 0
 
@@ -117,8 +119,8 @@ def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, worker
     else:
         for problem in problems:
             print(f"sprung: {problem}", file=sys.stderr)
-        counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
-        print(f"{counted}; {before} of them done before; {seconds:.0f} s on {tasks.name}; reports in {out}")
+        by_verdict = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+        print(f"{by_verdict}; {before} of them done before; {seconds:.0f} s on {tasks.name}; reports in {out}")
     return 0 if set(verdicts) == {"consistent"} else 1
 
 
@@ -160,7 +162,11 @@ def run_consume(options: dict[str, Any], address: str, alive: Path | None) -> in
         ingest.start()
         stack.callback(ingest.close)
         asyncio.run(_consume(address, settings.late_seconds, ingest, counts, alive))
-    print(f"{counts.messages} messages with {counts.windows} windows stored, {counts.refused} refused", flush=True)
+    print(
+        f"{counted(counts.messages, 'message')} with {counted(counts.windows, 'window')} stored, "
+        f"{counts.refused} refused",
+        flush=True,
+    )
     return 0
 
 

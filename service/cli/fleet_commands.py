@@ -93,7 +93,9 @@ def backfill(
     weights: Weights = None,
     json_lines: Json = False,
 ) -> int:
-    """Compute the history of many recordings anew, in parallel, and replace the existing one.
+    """Compute the history of many recordings anew.
+
+    In parallel; it replaces the existing one.
 
     Restarted, it continues where it stopped.  Unreadable files are reported at the end.
     """
@@ -114,7 +116,10 @@ def diagnose(
     dbc: Dbc = None,
     json_lines: Json = False,
 ) -> int:
-    """Diagnose many recordings, in parallel; exit status 1 when one is not consistent or cannot be read."""
+    """Diagnose many recordings, in parallel.
+
+    Exit status 1 when one is not consistent or cannot be read.
+    """
     one_thread_each()
     from sprung.service.cli.fleet import run_diagnose
 
@@ -136,7 +141,10 @@ def serve(
     system: System = None,
     weights: Weights = None,
 ) -> int:
-    """Ingest on Ray Serve: POST /ingest/estimates and /ingest/windows, identified in batches, folded into one store."""
+    """Take estimates and windows in, on Ray Serve.
+
+    POST /ingest/estimates and /ingest/windows, identified in batches, folded into one store.
+    """
     one_thread_each()
     from sprung.service.api.ray_serving import ServingSizes
     from sprung.service.cli.fleet import run_serve
@@ -155,7 +163,10 @@ def consume(
     system: System = None,
     weights: Weights = None,
 ) -> int:
-    """Fold the messages of a broker, acknowledged once they are stored; several may do so on one PostgreSQL store."""
+    """Store the messages of a broker.
+
+    They are acknowledged once they are stored; several may do so on one PostgreSQL store.
+    """
     one_thread_each()
     from sprung.service.cli.fleet import run_consume
 
@@ -164,7 +175,10 @@ def consume(
 
 @fleet.command("migrate")
 def migrate(store: StoreUrl = None) -> int:
-    """Bring the store's tables to this version and make the partitions of this month and the next, then end."""
+    """Bring the store's tables to this version.
+
+    Makes the partitions of this month and the next, then ends.
+    """
     from sprung.service.cli.fleet import run_migrate
 
     return run_migrate(store)
@@ -175,7 +189,10 @@ def demo(
     vehicles: Annotated[int, typer.Option("--vehicles", min=1, max=50)] = 3,
     port: Annotated[int, typer.Option("--port", metavar="NUMBER", min=1, max=65000, help="Of the pages.")] = 8000,
 ) -> int:
-    """The fleet variant on this machine: PostgreSQL, Ray Serve, pages, and vehicles that replay a recording."""
+    """Run the fleet variant on this machine.
+
+    PostgreSQL, Ray Serve, pages, and vehicles that replay a recording.
+    """
     from sprung.service.cli.fleet_demo import run
 
     return run(vehicles, port)

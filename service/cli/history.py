@@ -6,6 +6,7 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
+from sprung.model.text import counted
 from sprung.service.cli.options import time_of
 from sprung.service.cli.targets import check_file
 from sprung.service.errors import UserError
@@ -51,7 +52,10 @@ def run(
         sys.stdout.buffer.flush()
     else:
         out.write_bytes(body)
-        print(f"{out}: {len(found.time)} points of {len(parameters or known)} parameters", file=sys.stderr)
+        print(
+            f"{out}: {counted(len(found.time), 'point')} of {counted(len(parameters or known), 'parameter')}",
+            file=sys.stderr,
+        )
     return 0
 
 

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from sprung.model.text import counted
 from sprung.service.cli.console import errors
 from sprung.service.monitoring.processed import Batch
 from sprung.service.sources.feed import OnBatch
@@ -30,7 +31,7 @@ class RecordingProgress:
         self._windows += len(batch.records)
         recorded = self._windows * self._hop
         pace = recorded / max(time.monotonic() - self._started, 1e-6)
-        return f"{self._name}: {self._windows} windows, {recorded:.0f} s recorded, {pace:.0f} x real time"
+        return f"{self._name}: {counted(self._windows, 'window')}, {recorded:.0f} s recorded, {pace:.0f} x real time"
 
 
 @contextmanager

@@ -218,7 +218,7 @@ def closing_line(view: VehicleView, fed: FeedResult) -> str:
     if fed.adequate < fed.windows["used"] + fed.windows["repaired"]:
         lines.append(f"{fed.adequate} of {fed.windows['used'] + fed.windows['repaired']} windows fit the model")
     if fed.stored_before:
-        lines.append(f"{fed.stored_before} windows were in the store already")
+        lines.append(f"{fed.stored_before} window{'s were' if fed.stored_before != 1 else ' was'} in the store already")
     for alarm in view.active:
         what = changed_part(alarm) or "windows no longer fit the model"
         advice = "; `sprung diagnose` looks for the cause" if alarm.kind == "misfit" else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sprung.model.text import counted
 from sprung.service.housekeeping import Housekeeping
 from sprung.service.settings import settings_with
 from sprung.service.store import open_store
@@ -21,7 +22,8 @@ def run(dry_run: bool, store: str | None) -> int:
     would = "would be forgotten" if dry_run else "are forgotten"
     room = f" ({found.windows_for_room} of them to make room)" if found.windows_for_room else ""
     print(
-        f"as of {to_iso(now)}: {found.windows} windows{room}, {found.minutes} one-minute roll-ups and "
-        f"{len(found.upload_files)} uploaded files {would}"
+        f"as of {to_iso(now)}: {counted(found.windows, 'window')}{room}, "
+        f"{counted(found.minutes, 'one-minute roll-up')} and "
+        f"{counted(len(found.upload_files), 'uploaded file')} {would}"
     )
     return 0

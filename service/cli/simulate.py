@@ -11,6 +11,7 @@ import numpy as np
 from sprung.model.laws import CATALOGUE, Law
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import MANCHESTER, load_system
+from sprung.model.text import counted
 from sprung.replay.record import Record
 from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
 from sprung.service.can_database import database_of
@@ -49,7 +50,10 @@ def simulate(
         out, system.channels, values, system.sample_rate, record.start, dbc=database, vehicle=record.vehicle
     )
     laws = ", ".join(f"{law.law.name} at {law.location}" for law in system.laws) or "none"
-    print(f"{out}: {len(values)} samples of {len(system.channels)} channels; laws: {laws}", file=sys.stderr)
+    print(
+        f"{out}: {counted(len(values), 'sample')} of {counted(len(system.channels), 'channel')}; laws: {laws}",
+        file=sys.stderr,
+    )
     return 0
 
 

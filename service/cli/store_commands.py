@@ -18,7 +18,10 @@ def retention(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be deleted.")] = False,
     store: StoreUrl = None,
 ) -> int:
-    """Delete now what is older than the settings SPRUNG_RETENTION_... keep; the service does so every hour."""
+    """Delete now what is too old to be kept.
+
+    As the settings SPRUNG_RETENTION_... have it; the service does so every hour.
+    """
     from sprung.service.cli.retention import run
 
     return run(dry_run, store)
@@ -29,7 +32,10 @@ def backup(
     data_dir: DataDir = None,
     store: StoreUrl = None,
 ) -> int:
-    """Back up store, uploads and reports into one file; the service may run meanwhile."""
+    """Back up store, uploads and reports into one file.
+
+    The service may run meanwhile.
+    """
     from sprung.service.cli.backup import run
 
     return run(target, data_dir, store)

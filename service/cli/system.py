@@ -17,6 +17,7 @@ from sprung.model.identification.identify import identifiability
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.systemfile import json_schema
+from sprung.model.text import counted
 from sprung.service.cli.export import export, left_out
 from sprung.service.cli.targets import check_file
 from sprung.service.rendering.render import quantity
@@ -31,7 +32,8 @@ def import_matrices(file: Path, out: Path, rate: float | None, name: str | None)
     system = parse_system(text, str(out))
     out.write_text(text, encoding="utf-8")
     print(
-        f"{out}: {len(system.bodies)} bodies, {len(system.elements)} elements, {len(system.sensors)} sensors; "
+        f"{out}: {counted(len(system.bodies), 'body', 'bodies')}, {counted(len(system.elements), 'element')}, "
+        f"{counted(len(system.sensors), 'sensor')}; "
         "set noises and columns to those of your recordings",
         file=sys.stderr,
     )
@@ -63,8 +65,10 @@ def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = No
         console = Console(highlight=False, markup=False, width=110, no_color=True)
     console.print(
         Text(system.name, style="bold"),
-        f": {len(system.bodies)} bodies, {len(system.mechanics.dofs)} degrees of freedom, "
-        f"{len(system.inputs)} input signals, {len(system.elements)} elements, {len(system.sensors)} sensors; "
+        f": {counted(len(system.bodies), 'body', 'bodies')}, "
+        f"{counted(len(system.mechanics.dofs), 'degree of freedom', 'degrees of freedom')}, "
+        f"{counted(len(system.inputs), 'input signal')}, {counted(len(system.elements), 'element')}, "
+        f"{counted(len(system.sensors), 'sensor')}; "
         f"{system.window} samples at {system.sample_rate:g} Hz; digest {system.digest}",
         sep="",
     )

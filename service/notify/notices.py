@@ -136,13 +136,13 @@ def receivers(settings: Settings) -> tuple[str, ...]:
     """Webhooks, then mail addresses as mailto:.  Raises UserError for one that cannot be."""
     found = []
     allowed = outside.networks(settings.webhook_networks)
-    for url in settings.webhooks.replace(",", " ").split():
+    for url in settings.webhooks:
         try:
             _plainly_allowed(outside.safe_url(url).host, allowed)
         except ValueError as error:
             raise UserError(f"setting webhooks (SPRUNG_WEBHOOKS): {error}") from None
         found.append(url)
-    for address in settings.mail_to.replace(",", " ").split():
+    for address in settings.mail_to:
         if "@" not in address.strip("@") or len(address) > 250:
             raise UserError(f"setting mail_to (SPRUNG_MAIL_TO): {address[:80]!r} is no mail address")
         found.append(f"mailto:{address}")

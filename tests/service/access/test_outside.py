@@ -21,7 +21,7 @@ from sprung.service.notify.notices import Notices
 from sprung.service.settings import Settings
 from sprung.service.store import Store
 
-LOCAL = outside.networks("127.0.0.0/8 ::1")
+LOCAL = outside.networks(("127.0.0.0/8", "::1"))
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_public_addresses_are_called(address: str) -> None:
 
 
 def test_a_network_of_the_settings_opens_only_itself() -> None:
-    allowed = outside.networks("10.1.0.0/16, fd00::/8")
+    allowed = outside.networks(("10.1.0.0/16", "fd00::/8"))
     assert outside.judged(ipaddress.ip_address("10.1.2.3"), allowed) is None
     assert outside.judged(ipaddress.ip_address("fd12::1"), allowed) is None
     assert outside.judged(ipaddress.ip_address("10.2.2.3"), allowed) is not None
@@ -121,9 +121,9 @@ def test_receivers_on_this_host_need_a_word_in_the_settings(tmp_path: Path, stor
     settings: dict[str, Any] = {"data_dir": tmp_path, "webhooks": "http://127.0.0.1:8080/hook"}
     with pytest.raises(UserError, match="SPRUNG_WEBHOOK_NETWORKS"):
         Notices(Settings(**settings), store)
-    Notices(Settings(**settings, webhook_networks="127.0.0.0/8"), store)
+    Notices(Settings(**settings, webhook_networks=("127.0.0.0/8",)), store)
     with pytest.raises(UserError, match=r"^setting webhook_networks \(SPRUNG_WEBHOOK_NETWORKS\): "):
-        Notices(Settings(**settings, webhook_networks="127.0.0.1/8"), store)
+        Notices(Settings(**settings, webhook_networks=("127.0.0.1/8",)), store)
 
 
 def test_a_receiver_that_drips_is_hung_up_on() -> None:

@@ -250,6 +250,15 @@ def test_a_setting_that_cannot_be_is_named(capsys: pytest.CaptureFixture[str], m
     assert "SPRUNG_BATCH_WINDOWS" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("given", ["10.0.0.2,172.16.0.0/12", "10.0.0.2 172.16.0.0/12", '["10.0.0.2", "172.16.0.0/12"]'])
+def test_lists_are_separated_by_commas_everywhere(given: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("trusted_proxies", "webhook_networks", "allowed_hosts", "webhooks", "mail_to"):
+        monkeypatch.setenv(f"SPRUNG_{name.upper()}", given)
+    settings = settings_with({})
+    assert settings.trusted_proxies == settings.webhook_networks == settings.mail_to == ("10.0.0.2", "172.16.0.0/12")
+    assert settings.allowed_hosts == settings.webhooks == settings.mail_to
+
+
 def test_a_setting_that_is_nearly_one_is_told(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -272,6 +281,18 @@ def test_help_and_version_are_exit_status_zero(capsys: pytest.CaptureFixture[str
     out = capsys.readouterr().out
     assert all(command in out for command in ("replay", "serve", "train", "diagnose", "system", "bench"))
     assert "completion" in out
+
+
+@pytest.mark.parametrize("group", [[], ["fleet"], ["token"]])
+def test_help_describes_every_command_in_one_line_of_80_columns(
+    group: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([*group, "--help"]) == 0
+    commands = capsys.readouterr().out.partition("Commands:")[2].strip().splitlines()
+    assert len(commands) > 3
+    assert all(line.startswith("  ") or number == 0 for number, line in enumerate(commands))
+    assert all(line.endswith(".") and not line.endswith("...") for line in commands)
 
 
 def test_bench_without_a_name_lists_them(capsys: pytest.CaptureFixture[str]) -> None:

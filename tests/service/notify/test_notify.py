@@ -76,8 +76,8 @@ def receiver(received: Received) -> Iterator[str]:
 def core(engine: Engine, data_dir: Path, receiver: str) -> Core:
     settings = Settings(
         data_dir=data_dir,
-        webhooks=receiver,
-        webhook_networks="127.0.0.0/8",
+        webhooks=(receiver,),
+        webhook_networks=("127.0.0.0/8",),
         webhook_secret=SECRET,
         public_url="https://sprung.example.org",
     )
@@ -173,7 +173,7 @@ def test_mail_goes_through_smtp(tmp_path: Path, store: Store) -> None:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         settings = Settings(
-            data_dir=tmp_path, mail_to="depot@example.org", smtp_host="127.0.0.1", smtp_port=server.server_address[1]
+            data_dir=tmp_path, mail_to=("depot@example.org",), smtp_host="127.0.0.1", smtp_port=server.server_address[1]
         )
         notices = Notices(settings, store)
         with store.write() as connection:
@@ -195,7 +195,7 @@ def test_a_lost_bus_is_reported_once_and_told_when_it_is_back(tmp_path: Path, st
         detail: str = "no such device"
 
     feed = Feed()
-    settings = Settings(data_dir=tmp_path, webhooks="http://127.0.0.1:1/", webhook_networks="127.0.0.0/8")
+    settings = Settings(data_dir=tmp_path, webhooks=("http://127.0.0.1:1/",), webhook_networks=("127.0.0.0/8",))
     notices = Notices(settings, store, lambda: [feed])  # type: ignore[list-item]
     for works in (True, False, False, True):
         feed.works = works
