@@ -37,8 +37,8 @@ from sprung.model.diagnosis.rules import RULES, Rules, reason
 from sprung.model.system import System
 
 ALONE = {  # stages of recordings of their own, with what decides there
-    "component": ("component", "verdict"),
-    "ambient": ("ambient", "verdict"),
+    "component": ("white_noise", "component", "verdict"),
+    "ambient": ("white_noise", "ambient", "verdict"),
 }
 LAST = ("verdict", "report")  # stages that read finished investigations
 LATE = ("evidence", "selection", "plausible", "acceptance", "formula", "noise")  # stages that go on from begun ones
@@ -140,7 +140,7 @@ def run(
     lines = [figure(key, one, done) for key, one in keys]
     yield from lines
     if write is not None:
-        before = json.loads(write.read_text(encoding="utf-8"))["numbers"] if write.exists() else {}
+        before = json.loads(write.read_text(encoding="utf-8")) if write.exists() else {}
         write.write_text(quoted(lines, done, budget, before), encoding="utf-8")
     yield {
         "numbers": len(lines),
@@ -178,7 +178,7 @@ def _numbers(number: Field[Any]) -> list[Any]:
 
 def vary(subject: Subject, stage: str, number: Field[Any]) -> dict[str, Any] | None:
     """Set a number to both ends of its range on a recording; what changes.  None: its stage does not read it."""
-    if stage not in subject.reads if subject.reads else stage in ALONE:
+    if stage not in subject.reads if subject.reads else stage in ("component", "ambient"):
         return None
     changed, decades = [], 0.0
     for end in number.metadata["range"]:
@@ -220,16 +220,18 @@ def quoted(
     """What the reasons of the rules say of a run, as JSON of a line per number: what is said otherwise at which end.
 
     before: what was known.  A number that is what it was, and was varied on more recordings then, keeps that, and so
-    do numbers that this run did not vary.
+    do numbers that this run did not vary.  The set that is named is the larger one.
     """
+    before = before or {"recordings": [], "numbers": {}}
+    known_of, smaller = before["numbers"], len(done) < len(before["recordings"])
     others = {f"{n}.{one.name}" for n, one in RULES.constants()} - {
         f"{line['stage']}.{line['number']}" for line in lines
     }
-    numbers = {name: found for name, found in (before or {}).items() if name in others} | {
+    numbers = {name: found for name, found in known_of.items() if name in others} | {
         f"{line['stage']}.{line['number']}": {
             "varied": [line["value"], *line["range"]],
             "recordings": line["recordings"],
-            **({"on": line["on"]} if line["recordings"] <= _NAMED else {}),
+            **({"on": line["on"]} if smaller or line["recordings"] <= _NAMED else {}),
             "changes": [_words(change) for change in line["changed"]],
         }
         for line in lines
@@ -237,12 +239,14 @@ def quoted(
     }
     for line in lines:
         name = f"{line['stage']}.{line['number']}"
-        known = (before or {}).get(name)
+        known = known_of.get(name)
         if known is None or known["recordings"] <= line["recordings"]:
             continue
         if known["varied"] == [line["value"], *line["range"]]:
             numbers[name] = known
     head = {"set": f"{len(done)} recordings ({budget})", "recordings": [one["recording"] for one in done]}
+    if smaller:
+        head = {key: before[key] for key in head}
     rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(found)}" for name, found in numbers.items())
     return f'{json.dumps(head)[:-1]},\n "numbers": {{\n{rows}\n}}}}\n'
 

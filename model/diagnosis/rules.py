@@ -73,6 +73,27 @@ class RecordRules:
         7, "the same of an integrated acceleration; chosen: its fast noise is small, and fast motion is not", 5, 8
     )
     least_noise: float = rule(0.2, "of a declared noise that an estimate may fall to; chosen: data sheets", 0.1, 0.4)
+    undeclared: float = rule(1e-3, "of a signal, noise of a channel that declares none; chosen: 10 bits", 3e-4, 3e-3)
+    shock: float = rule(9.0, "of a sample's power over the mean, that counts; derived: three deviations", 4.0, 16.0)
+    cut_seconds: float = rule(0.5, "s that a cut may be moved to a quiet moment; chosen: a joint passes", 0.25, 1.0)
+    cut_share: float = rule(0.01, "of the recording, the same at most; chosen", 0.005, 0.02)
+    cut_samples: int = rule(7, "for the level around a cut; chosen: what leaks from an end", 5, 11)
+
+
+@dataclass(frozen=True)
+class WhiteNoiseRules:
+    """White noise of a channel from its fastest changes."""
+
+    order: int = rule(6, "of differences; derived: motion above a third of the sample rate passes", 5, 8)
+    upper_order: int = rule(8, "the same for the most noise there can be; chosen", 6, 10)
+    blocks: int = rule(40, "whose median counts; chosen: bursts are no noise", 20, 80)
+    filtered_samples: int = rule(100, "of blocks in which a filter's cutoff is looked for; chosen", 60, 200)
+    filtered_blocks: int = rule(5, "of them at least; chosen: a median", 3, 8)
+    even_from: float = rule(0.26, "of the sample rate, where three even bands begin; chosen: above motion", 0.22, 0.28)
+    even_to: float = rule(0.38, "the same, where they end; derived: below the cutoff of usual filters", 0.36, 0.4)
+    empty_from: float = rule(0.46, "the same, above which a filter leaves nothing; derived", 0.44, 0.48)
+    even: float = rule(1.8, "ratio of the powers of even bands; chosen: chance of few blocks", 1.5, 2.5)
+    empty: float = rule(0.2, "of them that an empty band has at most; chosen: a filter leaves 0.01", 0.1, 0.3)
 
 
 @dataclass(frozen=True)
@@ -88,6 +109,20 @@ class FitRules:
         3e6,
         3e7,
     )
+    done: float = rule(
+        0.02, "fall of the objective per deviation moved, that ends a fit; derived: little of 6", 0.005, 0.05
+    )
+    numerical: float = rule(
+        0.3, "promised fall, below which a failed step ends a fit; derived: half of the next", 0.1, 0.6
+    )
+    unsettled: float = rule(0.6, "last fall, beyond which a fit is compared with none; derived: a tenth of 6", 0.3, 1.0)
+    smoothing: float = rule(5e-4, "of chi-square, by which smoothing the inputs anew may move it; chosen", 2e-4, 1e-3)
+    patience: float = rule(1.0, "times the steps of every fit, which converge before; chosen", 0.7, 1.5)
+    restarts: int = rule(5, "of a fit that has not converged; chosen", 3, 8)
+    restarted: int = rule(10, "steps of each; chosen", 6, 15)
+    renewals: int = rule(12, "of noise levels, each with a fit; chosen", 8, 20)
+    renewed: float = rule(0.05, "change of a force's noise, below which it is as found; chosen", 0.02, 0.1)
+    shared: float = rule(0.2, "deviations of the channels' common gain, up to which it is 1; chosen", 0.1, 0.4)
 
 
 @dataclass(frozen=True)
@@ -252,6 +287,8 @@ class NoiseRules:
     bins: int = rule(20, "above the band, for the noise level; derived: their level is known to 20 %", 10, 40)
     blocks: int = rule(24, "of the band, whose median is a sensor's level; chosen: physics fills few", 12, 48)
     own: float = rule(0.01, "of a bin's variance, from which it informs on a sensor's own noise; chosen", 0.003, 0.03)
+    quieter: float = rule(0.3, "of the blocks, whose level is that of noise alone; chosen: physics fills few", 0.2, 0.4)
+    agree: float = rule(4.0, "deviations within which blocks agree with it; derived: one in 16 000", 3.0, 6.0)
     fall: float = rule(0.01, "of a force's noise power, that one round may leave; chosen: steps of ten", 0.003, 0.1)
     misdeclared: float = rule(
         10.0, "times a declared noise, that a displacement may show; chosen: a slip of ten", 5.0, 20.0
@@ -395,6 +432,9 @@ class ComponentRules:
     turn: float = rule(0.05, "of the travel's range, that a turning point turns by; chosen", 0.02, 0.1)
     cycles: int = rule(6, "turning points of what repeats itself; derived: three cycles", 4, 10)
     still_samples: int = rule(25, "of a standstill; derived: its noise is then known to 14 %", 15, 50)
+    cycles_alike: float = rule(0.8, "of the cycles, that must be; chosen: ends of a test differ", 0.6, 0.9)
+    limits: float = rule(1.0, "times the range of every shape, as its law states it; chosen", 0.8, 1.1)
+    surface: int = rule(16, "values that an unnamed force counts as; chosen: its splines have 80, smoothed", 8, 40)
     one_cycle: float = rule(0.1, "of a cycle's travel and duration, within which all are one; chosen", 0.05, 0.2)
     stretches: int = rule(20, "of the fitted part, with errors of their own; derived: a covariance needs some", 10, 40)
     formula_reach: float = rule(20.0, "times the usual size of a length or rate, either way; chosen", 10.0, 40.0)
@@ -410,6 +450,7 @@ class AmbientRules:
     alpha: float = rule(1e-4, "chance of a false variation over windows; chosen", 1e-5, 1e-3)
     varies: float = rule(0.02, "of a parameter's logarithm; derived: a hundredth of a frequency", 0.01, 0.04)
     spread: float = rule(4.0, "deviations of single windows by which most of them must differ; chosen", 2.0, 8.0)
+    within: float = rule(0.7, "of the windows, over which a variation reaches; chosen: others are outliers", 0.5, 0.8)
     sure: float = rule(0.03, "deviation of a window that stands for the lowest or highest value; chosen", 0.015, 0.06)
     undetermined: float = rule(0.3, "deviation of a log-ratio from which a window is uninformative; chosen", 0.15, 0.5)
     coarse: float = rule(0.15, "of the power elsewhere by random errors, from which advice is given; chosen", 0.08, 0.3)
@@ -433,6 +474,7 @@ class Rules:
     """The rules of every stage, in the order in which they decide."""
 
     record: RecordRules = RecordRules()
+    white_noise: WhiteNoiseRules = WhiteNoiseRules()
     fit: FitRules = FitRules()
     setup: SetupRules = SetupRules()
     screening: ScreeningRules = ScreeningRules()

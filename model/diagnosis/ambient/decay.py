@@ -21,7 +21,7 @@ def decay_stretch(signals: Signals, noise: FloatArray, all_rules: Rules = RULES)
     begin = _begin(signals, noise, rules)
     if begin is None:
         return None
-    level = np.maximum(noise, roughness(signals.sensors))
+    level = np.maximum(noise, roughness(signals.sensors, all_rules.white_noise))
     rest = np.median(signals.sensors[-signals.samples // rules.spans :], axis=0)
     moved = (signals.sensors[begin:] - rest) / level
     edges = np.linspace(0, len(moved), rules.spans + 1).astype(int)

@@ -164,5 +164,6 @@ def _with_surface(judged: JudgedComponent) -> JudgedComponent:
         return judged
     count = effective_count(after.residual[: task.split])
     gain = level_gain(before.error, after.error, count)
-    step = Step(Ranked(after, gain, gain, count), Ranked(before, 0.0, 0.0, count), (), chance(gain, 16, 1))
+    by_chance = chance(gain, after.task.rules.surface, 1)
+    step = Step(Ranked(after, gain, gain, count), Ranked(before, 0.0, 0.0, count), (), by_chance)
     return replace(judged, final=after, surface=step)

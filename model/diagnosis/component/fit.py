@@ -279,6 +279,8 @@ def refined(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     log = np.array([low > 0 for low, _ in limits])
     low, high = np.array(limits, dtype=float).T
     low, high = (np.where(log, np.log(np.where(log, x, 1.0)), x) for x in (low, high))
+    wider = 0.5 * (task.rules.limits - 1) * (high - low)
+    low, high = low - wider, high + wider
     inner = np.where(log, np.log(np.where(log, start, 1.0)), start)
     inner = np.clip(inner, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
 

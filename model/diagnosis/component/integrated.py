@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from sprung.model.diagnosis.component.motion import without_gaps
 from sprung.model.diagnosis.record.white_noise import white_noise
-from sprung.model.diagnosis.rules import ComponentRules
+from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
 
 _RAMP = 0.6  # of the lowest frequency, start of the filter's transition
@@ -31,15 +31,15 @@ class IntegratedMotion:
     lowest: float  # Hz, edge of the filter
 
 
-def integrated(acceleration: FloatArray, sample_rate: float, rules: ComponentRules) -> IntegratedMotion | None:
+def integrated(acceleration: FloatArray, sample_rate: float, all_rules: Rules = RULES) -> IntegratedMotion | None:
     """Motion from an acceleration (T,), m/s^2; None if it contains nothing but noise."""
-    good = np.isfinite(acceleration)
+    rules, good = all_rules.component, np.isfinite(acceleration)
     at = np.arange(len(acceleration))
     series = without_gaps(acceleration)
     series = series - series.mean()
     whole, frequency = _mirrored(series, sample_rate)
     spectrum = np.fft.rfft(whole)
-    noise = white_noise(series)
+    noise = white_noise(series, all_rules.white_noise)
     lowest = _lowest(
         np.abs(spectrum) ** 2 / len(whole),
         frequency,

@@ -24,7 +24,7 @@ from sprung.model.diagnosis.component.own import observed, own_pieces
 from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
 from sprung.model.diagnosis.record.white_noise import white_noise
-from sprung.model.diagnosis.rules import RULES, ComponentRules, Rules
+from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.laws import Law, SpringDamper
 from sprung.model.laws.following import Covariate
 from sprung.model.schema import GROUND, ElementSensor, SupportInput
@@ -140,7 +140,7 @@ def _record(
     """One component test.  Errors: as `component_records`."""
     notes: list[str] = []
     measured = _measured(system, values, sample_rate, element, sensor, rules, notes)
-    rests = still_stretches(measured.displacement, sample_rate, rules.component)
+    rests = still_stretches(measured.displacement, sample_rate, rules)
     run = _between(rests, len(measured.force), rules.record.minimum_samples)
     if run != slice(0, len(measured.force)):
         notes.append(
@@ -149,7 +149,7 @@ def _record(
         )
     velocity = None if measured.velocity is None else measured.velocity[run]
     begin = (measured.first + run.start) / sample_rate
-    motion = element_motion(measured.displacement[run], velocity, sample_rate, begin, rules.component)
+    motion = element_motion(measured.displacement[run], velocity, sample_rate, begin, rules)
     stated = system.file.elements[element]
     sizes = observed(motion, SpringDamper(stated.stiffness.value, stated.damping.value))
     given, held = given_model(system, element, sizes, notes)
@@ -162,7 +162,7 @@ def _record(
         nominal=NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping"))),
         rules=rules.component,
         signals=covariates(system, values, sample_rate, element, notes),
-        noise=max(noise_at_rest(measured.force, rests) or 0.0, white_noise(force)),
+        noise=max(noise_at_rest(measured.force, rests) or 0.0, white_noise(force, rules.white_noise)),
         declared=system.file.sensors[sensor].noise,
         held=held,
         delay_std=min(_delay_std(system, sensor), 1 / sample_rate),
@@ -192,7 +192,7 @@ def _measured(
 ) -> _Measured:
     """Motion and force of an element.  Errors: as `component_records`."""
     names = [channel.name for channel in (*system.channels, *system.signals)]
-    displacement, velocity, errors = _deflection(system, element, values, names, sample_rate, rules.component, notes)
+    displacement, velocity, errors = _deflection(system, element, values, names, sample_rate, rules, notes)
     force = _column(values, names, sensor)
     if errors.lowest > 0:
         force = without_slow(force, sample_rate, errors.lowest)
@@ -207,7 +207,7 @@ def _measured(
         notes.append(f"used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording")
     d, f = (without_gaps(series[first:last]) for series in (displacement, force))
     v = None if velocity is None else without_gaps(velocity[first:last])
-    if np.std(d) <= rules.component.moves * white_noise(d) or np.ptp(d) == 0:
+    if np.std(d) <= rules.component.moves * white_noise(d, rules.white_noise) or np.ptp(d) == 0:
         raise TooLittleError(f"too still to decide anything: {element} is not moved")
     if np.ptp(f) == 0:
         raise DiagnosisError(f"sensor {sensor} is stuck: it repeats one value; the test cannot be evaluated without it")
@@ -226,7 +226,7 @@ def _deflection(
     values: FloatArray,
     names: list[str],
     sample_rate: float,
-    rules: ComponentRules,
+    rules: Rules,
     notes: list[str],
 ) -> tuple[FloatArray, FloatArray | None, _Wandering]:
     """Deflection of an element (T,), upper less lower end; its rate if known at both ends; errors of integration."""
@@ -258,7 +258,7 @@ def _motion_of(
     values: FloatArray,
     names: list[str],
     sample_rate: float,
-    rules: ComponentRules,
+    rules: Rules,
     notes: list[str],
 ) -> tuple[FloatArray, FloatArray | None, _Wandering]:
     """Displacement of a support (T,), its rate if known, and errors of integration."""

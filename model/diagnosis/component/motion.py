@@ -16,7 +16,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sprung.model.diagnosis.record.white_noise import white_noise
-from sprung.model.diagnosis.rules import RULES, ComponentRules
+from sprung.model.diagnosis.rules import RULES, ComponentRules, Rules
 from sprung.model.signals import FloatArray
 
 ComplexArray = NDArray[np.complexfloating]
@@ -70,7 +70,8 @@ class ElementMotion:
         if len(at) < rules.cycles:
             return False
         travels, durations = np.abs(np.diff(self.deflection[at])), self.time[at[2:]] - self.time[at[:-2]]
-        low, middle, high = np.quantile(np.column_stack([travels[1:], durations]), [0.1, 0.5, 0.9], axis=0)
+        tail = 0.5 * (1 - rules.cycles_alike)
+        low, middle, high = np.quantile(np.column_stack([travels[1:], durations]), [tail, 0.5, 1 - tail], axis=0)
         return bool(np.all(high - low < rules.one_cycle * middle))
 
     def with_noise(self, deflection: float, rate: float) -> ElementMotion:
@@ -166,14 +167,16 @@ def without_gaps(series: FloatArray) -> FloatArray:
     return np.interp(at, at[good], series[good])
 
 
-def still_stretches(series: FloatArray, sample_rate: float, rules: ComponentRules = RULES.component) -> list[slice]:
+def still_stretches(series: FloatArray, sample_rate: float, all_rules: Rules = RULES) -> list[slice]:
     """Where a motion (T,) stands still."""
+    rules = all_rules.component
     span = max(rules.still_samples, int(rules.rest * sample_rate))
     if len(series) < 4 * span:
         return []
     mean = uniform_filter1d(series, span)
     deviation = np.sqrt(np.maximum(uniform_filter1d(series**2, span) - mean**2, 0.0))
-    rests = deviation < max(rules.rests * float(np.std(series)), 2.0 * white_noise(series))
+    noise = white_noise(series, all_rules.white_noise)
+    rests = deviation < max(rules.rests * float(np.std(series)), rules.moves * noise)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], rests.astype(int), [0]])))
     pairs = zip(edges[::2], edges[1::2], strict=True)
     return [slice(int(a), int(b)) for a, b in pairs if b - a >= span]
@@ -196,24 +199,24 @@ def element_motion(
     velocity: FloatArray | None,
     sample_rate: float,
     start: float = 0.0,
-    rules: ComponentRules = RULES.component,
+    rules: Rules = RULES,
 ) -> ElementMotion:
     """Motion from a measured displacement (T,) and, where there is one, a measured velocity (T,)."""
     count, step = len(displacement), 1 / sample_rate
     time = start + step * np.arange(count, dtype=np.float64)
     spectrum, omega, line = _continued(displacement, sample_rate)
-    noise = white_noise(displacement)
-    passed = _wiener(spectrum, noise, rules.stands_out)
+    noise = white_noise(displacement, rules.white_noise)
+    passed = _wiener(spectrum, noise, rules.component.stands_out)
     rate_spectrum = 1j * omega * passed * spectrum
     rate_power = omega**2 * passed**2 * noise**2
     if velocity is not None:
-        level = white_noise(velocity)
+        level = white_noise(velocity, rules.white_noise)
         seen, _, _ = _continued(velocity, sample_rate, odd=False)
         seen[0] -= (3 * count - 2) * line
         variance_d = (omega * noise) ** 2  # of the differentiated displacement
         share = variance_d / np.maximum(variance_d + max(level, 1e-300) ** 2, 1e-300)  # of the measured velocity
         rate_spectrum = share * seen + (1 - share) * 1j * omega * spectrum
-        rate_spectrum = _wiener(rate_spectrum, level, rules.stands_out) * rate_spectrum
+        rate_spectrum = _wiener(rate_spectrum, level, rules.component.stands_out) * rate_spectrum
         rate_power = share * level**2
     here = slice(count - 1, 2 * count - 1)
     rate = np.asarray(np.fft.irfft(rate_spectrum, 3 * count - 2)[here] + line, dtype=np.float64)

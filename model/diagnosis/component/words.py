@@ -23,8 +23,8 @@ from sprung.model.signals import FloatArray
 _DATA_SHEET_RATES = (0.05, 0.1, 0.2, 0.3, 0.52, 1.0, 1.5)  # m/s, at which damper makers quote forces
 _MIDDLE = 0.3  # of the travel, central part for dynamometer forces
 _FEWEST = 5  # samples for a force
+_BAND = 0.8  # of the residual's power, in the band that is told
 _NEAR_RATE = 0.05  # relative distance of a sample's rate
-_BAND = 0.8  # of the residual's power, for its main band
 
 _SPOKEN = frozenset(
     {"yield_force", "yield_displacement", "slip_force", "lost_motion", "breakaway_force", "force_at_knee"}

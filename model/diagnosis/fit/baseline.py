@@ -23,8 +23,6 @@ from sprung.model.system import System
 from sprung.model.work import WorkBudget
 
 _STRETCHES, _FEWEST, _STEPS = (16, 8, 4, 2), 60, 8  # divisors of a free decay fitted first; least samples; iterations
-_REFITS, _SETTLED = 12, 0.05  # alternations of fit and force noise; relative change of the level at convergence
-_ROUNDS, _MORE = 5, 10  # restarts of an unconverged fit, and their iterations
 _DIVERGED = (
     "the structure of the system file cannot be fitted to this recording: the estimates diverge; "
     "check units, signs and order of the channels, and the masses and stiffnesses of the system file"
@@ -69,7 +67,7 @@ def _begun(
     work: WorkBudget | None,
 ) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
-    declared = seen_noise(first, declared, rules.noise.misdeclared)
+    declared = seen_noise(first, declared, rules)
     noise = input_noise(transform(first, declared, rules.record), declared)
     part = transform(first, noise, rules.record, differentiated=drifting(system, signals.sensor_index))
     problem = Problem(system, part, signals.sensor_index, noise, rules, memory, work)
@@ -104,10 +102,10 @@ def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, sta
 
 def settled(problem: Problem, fit: Fit) -> Fit:
     """An unconverged fit, continued: the misfit of an unconverged fit looks like a further finding."""
-    for _ in range(_ROUNDS):
+    for _ in range(problem.rules.fit.restarts):
         if fit.converged:
             break
-        on = try_optimise(problem, fit.point, _MORE)
+        on = try_optimise(problem, fit.point, problem.rules.fit.restarted)
         if on is None or on.deviance >= fit.deviance:
             break
         fit = on
@@ -120,11 +118,11 @@ def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     Levels of forces come before those of sensors: beside an overestimated force noise, sensors seem to have no noise
     of their own.
     """
-    settled = 0
-    for _ in range(_REFITS):
+    settled, rules = 0, problem.rules.fit
+    for _ in range(rules.renewals):
         before = problem.noise
         noise = force_noise(fit.forward, fit.spectrum, before, problem.rules.noise)
-        if np.all(np.abs(noise.force / before.force - 1) < _SETTLED):
+        if np.all(np.abs(noise.force / before.force - 1) < rules.renewed):
             settled += 1
             noise = sensor_noise(fit.forward, fit.spectrum, noise, problem.rules.noise)
         renewed = replace(problem, noise=noise)

@@ -77,7 +77,7 @@ def _level(normalised: FloatArray, share: FloatArray, rules: NoiseRules) -> floa
     normalised, share = normalised[own], share[own]
     edges = np.linspace(0, len(normalised), rules.blocks + 1).astype(int)
     blocks = np.array([normalised[a:b].mean() for a, b in pairwise(edges)])
-    return max(1 + (_robust(blocks, np.diff(edges)) - 1) / float(np.median(share)), 0.05)
+    return max(1 + (_robust(blocks, np.diff(edges), rules) - 1) / float(np.median(share)), 0.05)
 
 
 def force_noise(forward: Forward, spectrum: ComplexArray, noise: Noise, rules: NoiseRules) -> Noise:
@@ -97,9 +97,9 @@ def force_noise(forward: Forward, spectrum: ComplexArray, noise: Noise, rules: N
     return noise
 
 
-def _robust(blocks: FloatArray, counts: np.ndarray) -> float:
+def _robust(blocks: FloatArray, counts: np.ndarray, rules: NoiseRules) -> float:
     """Robust level over blocks, (blocks,): the mean of those that agree with the quieter half."""
-    middle, quiet = np.median(blocks), np.quantile(blocks, 0.3)
+    middle, quiet = np.median(blocks), np.quantile(blocks, rules.quieter)
     spread = 1 / np.sqrt(np.mean(counts))
-    base = min(middle, quiet * (1 + 2 * spread))
-    return float(np.mean(blocks[blocks <= base * (1 + 4 * spread)]))
+    base = min(middle, quiet * (1 + 0.5 * rules.agree * spread))
+    return float(np.mean(blocks[blocks <= base * (1 + rules.agree * spread)]))

@@ -31,11 +31,6 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
-# Fall of the objective, twice a log-likelihood, below which a fit is done per standard deviation that it moved; below
-# which a step that fails has nothing to find; and beyond which a fit is no basis of comparisons: a tenth of the
-# margin by which one law is preferred to another
-_SMALL, _NUMERICAL, _UNSETTLED = 0.02, 0.3, 0.6
-_SMOOTHING = 5e-4  # share of chi-square by which smoothing the inputs anew may move it
 _DAMPING = (1e-6, 1e3)  # first and most, of the scaled normal equations
 
 
@@ -59,6 +54,7 @@ class Fit:
     motions: Motions
     left: float  # decrease of the objective in the last step, or predicted for a rejected one
     iterations: int
+    unsettled: float  # of its last decrease, beyond which a fit has not converged
     bounded: bool = False  # whether a law's parameter is at a bound
 
     def place(self, index: int) -> slice:
@@ -70,7 +66,7 @@ class Fit:
     @property
     def converged(self) -> bool:
         """Whether the last decrease of the objective is too small to matter."""
-        return self.left < _UNSETTLED * self.grain
+        return self.left < self.unsettled * self.grain
 
     @property
     def grain(self) -> float:
@@ -152,7 +148,7 @@ def optimise(
         iterations,
         tolerance,
         problem.newton_allowed,
-        problem.rules.fit.prior,
+        problem.rules.fit,
         None if whitener is None else whitener.factor,
     )
     key = key_of(problem.system, problem.part, problem.noise, start, *others)
@@ -164,8 +160,8 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
     state, unforced = _state(problem, *_begun(problem, start, whitener)), not problem.system.file.inputs
     if unforced:
         state = _begun_anew(problem, state)
-    damping, left, count = _DAMPING[0], np.inf, 0
-    for count in range(1, iterations + 1):
+    rules, damping, left, count = problem.rules.fit, _DAMPING[0], np.inf, 0
+    for count in range(1, max(1, round(rules.patience * iterations)) + 1):
         step, sigma, promised = _step(problem, state.lin, state.point, damping)
         size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
         grain = _grain(problem, state)
@@ -173,17 +169,17 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
         proposed = _state(problem, trial, working)
         if unforced:
             proposed = _begun_anew(problem, proposed)
-        if proposed.value >= state.value and promised < _NUMERICAL * grain:
+        if proposed.value >= state.value and promised < rules.numerical * grain:
             left = promised
             break
         rise = proposed.value - state.value
-        if 0 <= rise < _SMOOTHING * float(state.lin.residual @ state.lin.residual) and not problem.process_noise:
+        if 0 <= rise < rules.smoothing * float(state.lin.residual @ state.lin.residual) and not problem.process_noise:
             state = replace(state, working=working, value=_value_under(problem, state, working))
         if proposed.value < state.value:
             left = state.value - proposed.value
             state = proposed
             damping = max(damping / 10, _DAMPING[0] / 1e3)
-            if size < tolerance or left < _SMALL * grain * max(1.0, size):
+            if size < tolerance or left < rules.done * grain * max(1.0, size):
                 break
             if count in (2, 4):
                 state = replace(state, point=with_equivalents(problem, state.point, state.working.inputs))
@@ -331,5 +327,6 @@ def _finish(problem: Problem, state: _State, left: float, count: int) -> Fit:
         motions=lin.motions,
         left=left,
         iterations=count,
+        unsettled=problem.rules.fit.unsettled,
         bounded=any(t.bounded for t in point.terms),
     )

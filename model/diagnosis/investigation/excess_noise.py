@@ -17,7 +17,7 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     before, after: free runs without and with the findings.  A share of the power that the findings changed at a sensor
     may be their inaccuracy, and does not count as noise.
     """
-    declared = declared_noise(state.system, state.prepared.signals, state.options.rules.record)
+    declared = declared_noise(state.system, state.prepared.signals, state.options.rules)
     noise, rules = state.problem.noise, state.options.rules.noise
     grid = state.problem.part.grid
     count = grid.band.stop

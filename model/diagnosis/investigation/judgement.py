@@ -28,7 +28,7 @@ from sprung.model.laws import ElementLaw, Law, StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
-_BAND = 0.8  # of the residual's power, for its main band
+_BAND = 0.8  # of the residual's power, in the band that is told
 
 
 def judged(
@@ -144,7 +144,7 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
 def bounded(state: Investigation) -> Noise:
     """Noise levels for the floor: estimated ones, at most as declared or observed above the compared band."""
     prepared = state.prepared.signals
-    declared = declared_noise(state.system, prepared, state.options.rules.record)
+    declared = declared_noise(state.system, prepared, state.options.rules)
     present = np.isin(prepared.sensor_index, state.signals.sensor_index)
     known = declared.sensors[present]
     seen = upper_ratio(state, known) * known

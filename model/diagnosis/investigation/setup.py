@@ -193,7 +193,7 @@ def _best_on_a_stretch(
     rules, count = problem.rules.setup, problem.part.grid.samples
     if len(ranked) <= rules.tried + rules.beside or count <= rules.stretch:
         return ranked
-    first, last = liveliest(signals.sensors[:count], rules.stretch)
+    first, last = liveliest(signals.sensors[:count], rules.stretch, problem.rules.record.shock)
     stretch = signals.part(first, last)
 
     def misfit_of(hypothesis: Hypothesis | None) -> float:

@@ -26,7 +26,6 @@ from sprung.model.diagnosis.selection.plausible import hardly_there
 from sprung.model.signals import FloatArray
 
 _STEPS = 10  # of a fit from a close start
-_NEAR = 0.2  # standard deviations of the shared gain within which it is not changed
 
 
 def without_insignificant(state: Investigation) -> Investigation:
@@ -82,10 +81,11 @@ def _reported_covariance(state: Investigation) -> FloatArray:
 def _with_centred_gains(state: Investigation) -> Investigation:
     """The investigation with the gains of the inputs at the most likely common gain of all channels."""
     shared, spread = shared_gain(_instruments(state))
-    if not state.calibrations or abs(np.log(shared)) <= _NEAR * spread:
+    near = state.options.rules.fit.shared
+    if not state.calibrations or abs(np.log(shared)) <= near * spread:
         return state
     fit = _scaled(state, 1 / shared)
-    return state if fit is None or fit.deviance > state.fit.deviance + 1 / _NEAR else replace(state, fit=fit)
+    return state if fit is None or fit.deviance > state.fit.deviance + 1 / near else replace(state, fit=fit)
 
 
 def _scaled(state: Investigation, factor: float) -> Fit | None:

@@ -57,7 +57,7 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
             "at higher frequencies the sensors show nothing but noise"
         )
     begin, sample_rate = first / sample_rate + begin, sample_rate / factor
-    start, stop, used = _affordable(system, values, sample_rate, begin, rules.longest)
+    start, stop, used = _affordable(system, values, sample_rate, begin, rules)
     values, begin = values[start:stop], begin + start / sample_rate
     prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, begin, rules)
     signals = _above_drift(system, replace(prepared.signals, averaged=factor), notes, rules)
@@ -130,17 +130,17 @@ def _slowed(
 
 
 def _affordable(
-    system: System, values: FloatArray, sample_rate: float, begin: float, longest: int
+    system: System, values: FloatArray, sample_rate: float, begin: float, rules: RecordRules
 ) -> tuple[int, int, str]:
     """First and last sample of gap-free columns (T, C) that are diagnosed, and the stretch in words.
 
     begin: time of their first sample, s.
     """
-    if len(values) <= longest:
+    if len(values) <= rules.longest:
         return 0, len(values), ""
     sensors = values[:, len(system.inputs) :]
     present = np.isfinite(sensors).any(axis=0)
-    start, stop = liveliest(sensors[:, present], longest)
+    start, stop = liveliest(sensors[:, present], rules.longest, rules.shock)
     used = (
         f"{begin + start / sample_rate:.0f} s to {begin + stop / sample_rate:.0f} s of the recording, which has "
         f"{len(values) / sample_rate:.0f} s that can be used, were diagnosed, where the sensors move most: memory and "

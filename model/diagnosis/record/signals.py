@@ -20,14 +20,13 @@ from scipy.integrate import trapezoid
 from sprung.model.diagnosis.record.fused import FusedMotion, ParityResiduals, parity_residuals
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
 from sprung.model.diagnosis.record.white_noise import roughness, white_noise
-from sprung.model.diagnosis.rules import RULES, RecordRules
+from sprung.model.diagnosis.rules import RULES, RecordRules, Rules
 from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
 from sprung.model.schema import ForceInput, SupportInput
 from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-_UNDECLARED = 1e-3  # of a signal, noise that is not declared
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
 _SEEN = 1e-9  # of a rigid-body motion
 
@@ -126,55 +125,60 @@ class Part:
     parity: tuple[ParityResiduals, ...]  # of the supports whose acceleration is measured beside something else
 
 
-def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.record) -> Noise:
-    """Noise as the system file states it; where it states none, a thousandth of the signal.
+def declared_noise(system: System, signals: Signals, all_rules: Rules = RULES) -> Noise:
+    """Noise as the system file states it; where it states none, a share of the signal.
 
     Estimates of a sensor's may fall to a share of that, or of what its fastest changes leave room for.
     """
+    rules = all_rules.record
     inputs = system.file.inputs.values()
     supports = [source for source in inputs if isinstance(source, SupportInput)]
     forces = [source for source in inputs if isinstance(source, ForceInput)]
     declared = list(system.file.sensors.values())
     averaged = np.sqrt(signals.averaged)
-    motion = [_support_noise(source, signals, i) for i, source in enumerate(supports)]
+    motion = [_support_noise(source, signals, i, rules.undeclared) for i, source in enumerate(supports)]
     displacement, velocity, acceleration = np.array(motion).reshape(-1, 3).T / averaged
-    force = _stated_or_share([source.noise for source in forces], signals.force) / averaged
-    sensors = _stated_or_share([declared[i].noise for i in signals.sensor_index], signals.sensors) / averaged
-    least = rules.least_noise * np.minimum(sensors, roughness(signals.sensors))
+    force = _stated_or_share([source.noise for source in forces], signals.force, rules.undeclared) / averaged
+    of_sensors = [declared[i].noise for i in signals.sensor_index]
+    sensors = _stated_or_share(of_sensors, signals.sensors, rules.undeclared) / averaged
+    least = rules.least_noise * np.minimum(sensors, roughness(signals.sensors, all_rules.white_noise))
     return Noise(displacement, velocity, acceleration, force, sensors, least)
 
 
-def _support_noise(source: SupportInput, signals: Signals, i: int) -> tuple[float, float, float]:
-    """Noise of a support's displacement (m), velocity (m/s) and acceleration (m/s^2); inf where it is not measured."""
+def _support_noise(source: SupportInput, signals: Signals, i: int, undeclared: float) -> tuple[float, float, float]:
+    """Noise of a support's displacement (m), velocity (m/s) and acceleration (m/s^2); inf where it is not measured.
+
+    undeclared: of a signal, noise that is not declared.
+    """
     stated = {quantity: address.noise for quantity, address in source.measured.items()}
     size, fused = _size(signals.displacement[:, i]), bool(signals.accelerated[i])
-    displacement = stated.get("displacement", 0.0) or _UNDECLARED * size
+    displacement = stated.get("displacement", 0.0) or undeclared * size
     if signals.integrated[i]:
         displacement = _INTEGRATED * max(displacement, size)
     velocity = acceleration = np.inf
     if np.isfinite(signals.velocity[0, i]) or (fused and "velocity" in stated):
-        velocity = stated.get("velocity", 0.0) or _UNDECLARED * _size(signals.velocity[:, i])
+        velocity = stated.get("velocity", 0.0) or undeclared * _size(signals.velocity[:, i])
     if fused:
         acceleration = stated.get("acceleration", 0.0) or USUAL_NOISE["m/s^2"]
     return displacement, velocity, acceleration
 
 
-def _stated_or_share(stated: Sequence[float], series: FloatArray) -> FloatArray:
+def _stated_or_share(stated: Sequence[float], series: FloatArray, share: float) -> FloatArray:
     """Noise of channels (m,) as it is stated, else a share of their signals (N, m)."""
-    return np.array([noise or _UNDECLARED * _size(series[:, i]) for i, noise in enumerate(stated)])
+    return np.array([noise or share * _size(series[:, i]) for i, noise in enumerate(stated)])
 
 
-def seen_noise(signals: Signals, declared: Noise, most: float) -> Noise:
+def seen_noise(signals: Signals, declared: Noise, rules: Rules = RULES) -> Noise:
     """Noise of supports whose displacement is measured once: no less than their own fastest changes show.
 
-    A wheel or a table does not move near half the sample rate, so that white noise is what is left there.  Up to `most`
-    times what was declared; what a second measurement shows is estimated from both (`fit.noise.input_noise`).
+    A wheel or a table does not move near half the sample rate, so that white noise is what is left there.  Up to
+    some times what was declared; what a second measurement shows is estimated from both (`fit.noise.input_noise`).
     """
     once = ~signals.integrated & ~np.isfinite(declared.velocity) & ~np.isfinite(declared.acceleration)
     if not once.any():
         return declared
-    shown = np.array([white_noise(series) for series in signals.displacement.T])
-    level = np.clip(shown, declared.displacement, most * declared.displacement)
+    shown = np.array([white_noise(series, rules.white_noise) for series in signals.displacement.T])
+    level = np.clip(shown, declared.displacement, rules.noise.misdeclared * declared.displacement)
     return replace(declared, displacement=np.where(once, level, declared.displacement))
 
 

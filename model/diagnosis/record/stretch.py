@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from sprung.model.diagnosis.rules import RULES
 from sprung.model.signals import BoolArray, FloatArray
 
 
@@ -21,12 +22,15 @@ def standstill(values: FloatArray, least: int, share: float) -> BoolArray:
     return np.asarray(resting > share * present.sum())
 
 
-def liveliest(sensors: FloatArray, longest: int) -> tuple[int, int]:
-    """The stretch of `longest` samples in which the sensors (T, S) move most, relative to their mean power."""
+def liveliest(sensors: FloatArray, longest: int, shock: float = RULES.record.shock) -> tuple[int, int]:
+    """The stretch of `longest` samples in which the sensors (T, S) move most, relative to their mean power.
+
+    shock: most of its mean power that a sample counts as.
+    """
     power = (sensors - np.mean(sensors, axis=0)) ** 2
     mean = power.mean(axis=0)
     level = (power[:, mean > 0] / mean[mean > 0]).mean(axis=1) if np.any(mean > 0) else np.zeros(len(sensors))
-    around = uniform_filter1d(np.minimum(level, 9.0), longest, mode="nearest")  # a single shock counts little
+    around = uniform_filter1d(np.minimum(level, shock), longest, mode="nearest")
     half = longest // 2
     middle = half + int(np.argmax(around[half : len(sensors) - longest + half + 1]))
     return middle - half, middle - half + longest

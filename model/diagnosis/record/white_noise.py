@@ -2,39 +2,33 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from math import comb
 
 import numpy as np
 
+from sprung.model.diagnosis.rules import RULES, WhiteNoiseRules
 from sprung.model.signals import FloatArray
 
-_ORDER = 6  # of the differences of which the noise is estimated: they pass motion above a third of the sample rate
-_ROUGH_ORDER = 8  # the same for the upper limit of the noise
-_BLOCKS = 40  # of them, whose median counts: bursts are no noise
-_SAMPLES, _FEWEST = 100, 5  # samples of a block, and blocks at least, whose spectrum is looked at for a filter's cutoff
-_EVEN_BANDS = ((0.26, 0.30), (0.30, 0.34), (0.34, 0.38))  # of the sample rate, below the cutoff of any usual filter
-_EMPTY_BAND = (0.46, 0.5)  # of the sample rate, beyond it
-_EVEN, _EMPTY = 1.8, 0.2  # ratios of power: bands within the first are even, one below the second is empty
 
-
-def white_noise(series: FloatArray) -> float:
+def white_noise(series: FloatArray, rules: WhiteNoiseRules = RULES.white_noise) -> float:
     """Standard deviation of the white noise that a series (T,) carries, from its differences of high order.
 
     Smooth motion leaves them by its power above about a third of the sample rate only.  Of a series from which a
     filter took what is next to half the sample rate (`_below_the_cutoff`), that of the noise before the filter.
     """
-    differences = np.diff(series, _ORDER) ** 2 / comb(2 * _ORDER, _ORDER)
-    blocks = np.array_split(differences, min(_BLOCKS, max(1, len(differences) // 10)))
-    return max(float(np.sqrt(np.median([block.mean() for block in blocks]))), _below_the_cutoff(series))
+    differences = np.diff(series, rules.order) ** 2 / comb(2 * rules.order, rules.order)
+    blocks = np.array_split(differences, min(rules.blocks, max(1, len(differences) // 10)))
+    return max(float(np.sqrt(np.median([block.mean() for block in blocks]))), _below_the_cutoff(series, rules))
 
 
-def _below_the_cutoff(series: FloatArray) -> float:
+def _below_the_cutoff(series: FloatArray, rules: WhiteNoiseRules) -> float:
     """Standard deviation of white noise that a filter has cut off below half the sample rate, as resampling does.
 
     Its spectrum is even up to the filter's cutoff and has next to nothing beyond; 0 where it is not.
     """
-    count = min(_BLOCKS, len(series) // _SAMPLES)
-    if count < _FEWEST:
+    count = min(rules.blocks, len(series) // rules.filtered_samples)
+    if count < rules.filtered_blocks:
         return 0.0
     size = len(series) // count
     window = np.hanning(size)
@@ -42,13 +36,15 @@ def _below_the_cutoff(series: FloatArray) -> float:
     frequency = np.fft.rfftfreq(size)
     power = np.abs(np.fft.rfft(rest * window)) ** 2 / np.sum(window**2)
     power[:, 1:] /= (2 * np.sin(np.pi * frequency[1:])) ** 2
-    bands = [(frequency >= low) & (frequency < high) for low, high in (*_EVEN_BANDS, _EMPTY_BAND)]
+    edges = np.linspace(rules.even_from, rules.even_to, 4).round(9).tolist()
+    pairs = (*pairwise(edges), (rules.empty_from, 0.5))
+    bands = [(frequency >= low) & (frequency < high) for low, high in pairs]
     *even, empty = (float(np.median(power[:, band].mean(axis=1))) for band in bands)
-    cut = max(even) < _EVEN * min(even) and empty < _EMPTY * min(even)
+    cut = max(even) < rules.even * min(even) and empty < rules.empty * min(even)
     return float(np.sqrt(np.mean(even))) if cut else 0.0
 
 
-def roughness(series: FloatArray) -> FloatArray:
+def roughness(series: FloatArray, rules: WhiteNoiseRules = RULES.white_noise) -> FloatArray:
     """The strongest white noise that series (T, m) can hold, (m,): that of their differences of high order."""
-    differences = np.diff(series, _ROUGH_ORDER, axis=0)
-    return np.asarray(np.std(differences, axis=0) / np.sqrt(comb(2 * _ROUGH_ORDER, _ROUGH_ORDER)))
+    order = rules.upper_order
+    return np.asarray(np.std(np.diff(series, order, axis=0), axis=0) / np.sqrt(comb(2 * order, order)))

@@ -25,7 +25,7 @@ def vehicle() -> tuple[System, np.ndarray]:
 
 
 def found(system: System, values: np.ndarray) -> tuple[SetupFault, ...]:
-    signals, split = cut(prepare(system, values, 100.0).signals, 0.7)
+    signals, split = cut(prepare(system, values, 100.0).signals)
     declared = declared_noise(system, signals)
     problem, fit = baseline(system, signals, declared, split)
     return without_setup_faults(system, signals, declared, split, problem, fit)[2]

@@ -18,6 +18,7 @@ from sprung.model.diagnosis.investigation.significance import without_insignific
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.compete import compete
 from sprung.model.laws import find_law
 from sprung.model.system import parse_system
@@ -46,7 +47,7 @@ def test_a_fit_that_still_falls_is_fitted_on(monkeypatch: pytest.MonkeyPatch) ->
     left = iter(fits)
     monkeypatch.setattr(baseline, "try_optimise", lambda problem, point, steps: next(left))
     begin: Any = SimpleNamespace(deviance=90.0, converged=False, point=None)
-    problem: Any = None
+    problem: Any = SimpleNamespace(rules=RULES)
     assert baseline.settled(problem, begin) is fits[2]
     monkeypatch.setattr(baseline, "try_optimise", lambda problem, point, steps: None)
     assert baseline.settled(problem, begin) is begin

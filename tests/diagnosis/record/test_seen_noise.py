@@ -35,7 +35,7 @@ def measured_once(times: float) -> tuple[System, MadeRecord]:
 def test_noise_is_raised_to_what_shows_and_never_lowered(times: float, level: float) -> None:
     system, record = measured_once(times)
     signals = prepare(system, record.values, record.sample_rate).signals
-    (found,) = seen_noise(signals, declared_noise(system, signals), 10.0).displacement
+    (found,) = seen_noise(signals, declared_noise(system, signals)).displacement
     assert found == pytest.approx(level * TRUE, rel=0.1)
 
 
@@ -43,7 +43,7 @@ def test_what_is_measured_twice_keeps_what_was_declared() -> None:
     system, record = quarter_car(), simulate(seconds=6, seed=5)
     signals = prepare(system, record.values, record.sample_rate).signals
     declared = declared_noise(system, signals)
-    assert seen_noise(signals, declared, 10.0) is declared
+    assert seen_noise(signals, declared) is declared
 
 
 def test_a_third_of_the_noise_declared_is_no_missing_physics() -> None:

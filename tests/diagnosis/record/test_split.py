@@ -24,7 +24,7 @@ def signals() -> Signals:
 
 
 def test_parts_transform_quickly_and_keep_the_time_of_the_recording(signals: Signals) -> None:
-    cut_off, split = cut(signals, 0.7)
+    cut_off, split = cut(signals)
     first = round(cut_off.start * 100)
     assert all(max(prime_factors(length)) <= 11 for length in (split, cut_off.samples))
     assert 0 <= first <= 19 and signals.samples - 40 <= first + cut_off.samples <= signals.samples
@@ -34,16 +34,16 @@ def test_parts_transform_quickly_and_keep_the_time_of_the_recording(signals: Sig
 
 
 def test_blows_at_the_ends_and_at_the_split_are_cut_off(signals: Signals) -> None:
-    _, split = cut(signals, 0.7)
+    _, split = cut(signals)
     sensors = signals.sensors.copy()
     for at in (0, split - 1, split, signals.samples - 1):
         sensors[max(at - 2, 0) : at + 3] += 50 * np.std(sensors)
-    cut_off, moved = cut(replace(signals, sensors=sensors), 0.7)
+    cut_off, moved = cut(replace(signals, sensors=sensors))
     first = round(cut_off.start * 100)
     assert first > 2 and first + cut_off.samples < signals.samples - 2
     assert abs(first + moved - split) > 2
 
 
 def test_a_short_recording_is_only_shortened(signals: Signals) -> None:
-    cut_off, split = cut(signals.part(0, 50), 0.7)
+    cut_off, split = cut(signals.part(0, 50))
     assert cut_off.samples == 50 and cut_off.start == 0.0 and split == 35
