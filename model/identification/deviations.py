@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from sprung.model.schema import TrackInput
+from sprung.model.schema import ForceInput, MotionSensor, TrackInput
 from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
 from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
@@ -51,24 +51,41 @@ def deviations(system: System) -> tuple[Deviation, ...]:
 
 
 def clock_groups(system: System) -> IntArray:
-    """Channels of one message share its clock: the address up to its last part; shape (C,)."""
+    """Channels of one message share its clock: the address up to its last part; shape (C,).
+
+    Columns of a table say nothing of clocks: there, channels of one unit at one body are taken to have one, as they
+    come through the same node and filter.
+    """
     found: dict[str, int] = {}
     groups = []
-    for channel in system.channels:
+    for channel, body in zip(system.channels, _bodies(system), strict=True):
         address = channel.mcap or channel.can
-        message = address.rpartition(".")[0] if address else f"\0{channel.unit}"
+        message = address.rpartition(".")[0] if address else f"\0{body}\0{channel.unit}"
         groups.append(found.setdefault(message, len(found)))
     return np.array(groups, dtype=np.int64)
 
 
 def nodes(system: System) -> IntArray:
-    """Topics with one beginning come from one node: `/bogie1/acceleration`, `/bogie1/axlebox/velocity`; shape (C,)."""
+    """Topics with one beginning come from one node: `/bogie1/acceleration`, `/bogie1/axlebox/velocity`; shape (C,).
+
+    Where topics do not tell, what is measured at a body comes from one: cables are short.
+    """
     found: dict[str, int] = {}
     numbers = []
-    for channel in system.channels:
-        topic = (channel.mcap or "").strip("/").partition("/")
-        numbers.append(found.setdefault(topic[0], len(found)) if topic[1] else -1)
+    for channel, body in zip(system.channels, _bodies(system), strict=True):
+        node, _, rest = (channel.mcap or "").strip("/").partition("/")
+        numbers.append(found.setdefault(node if rest else f"\0{body}", len(found)))
     return np.array(numbers, dtype=np.int64)
+
+
+def _bodies(system: System) -> list[str]:
+    """The body at which each channel is measured: that on a support, and the lower one of an element."""
+    file = system.file
+    at = {name: e.lower if e.lower in file.bodies else e.upper for name, e in file.elements.items()}
+    moved = {e.lower: e.upper for e in file.elements.values() if e.lower in file.inputs}
+    moved |= {name: source.body for name, source in file.inputs.items() if isinstance(source, ForceInput)}
+    shown = {n: s.body if isinstance(s, MotionSensor) else at[s.element] for n, s in file.sensors.items()}
+    return [shown.get(c.name) or moved.get(c.name.partition(".")[0], "") for c in system.channels]
 
 
 def named(

@@ -36,13 +36,15 @@ class Cargo:
     past: FloatArray  # the load's logarithm before it was reopened, where it was known then, shape (L,)
     past_variance: FloatArray  # shape (L,)
     past_at: IntArray  # ns, start of the last window that determined it, shape (L,); 0: never
+    disputed: IntArray  # ns, start of the first window of those that contradict the believed loads; 0: none, shape (1,)
 
 
 def start(prior_variance: FloatArray) -> Cargo:
     """Nothing seen yet; variances (L,) of the loads' logarithms before any window."""
     zero = np.zeros(len(prior_variance))
     never = np.zeros(len(zero), dtype=np.int64)
-    return Cargo(zero, zero + UNKNOWN, zero + np.nan, zero, prior_variance, zero, zero, zero, never)
+    nobody = np.zeros(1, dtype=np.int64)
+    return Cargo(zero, zero + UNKNOWN, zero + np.nan, zero, prior_variance, zero, zero, zero, never, nobody)
 
 
 def remembered(cargo: Cargo, load: FloatArray, variance: FloatArray, known: BoolArray, at: int) -> Cargo:
@@ -53,6 +55,13 @@ def remembered(cargo: Cargo, load: FloatArray, variance: FloatArray, known: Bool
         past_variance=np.where(known, variance, cargo.past_variance),
         past_at=np.where(known, at, cargo.past_at),
     )
+
+
+def disputed(cargo: Cargo, at: int, *, contradicting: bool) -> Cargo:
+    """After a window that starts at `at`, ns, and is `contradicting` the believed loads, or not."""
+    since = int(cargo.disputed[0])
+    begins = (since or at) if contradicting else 0
+    return cargo if begins == since else replace(cargo, disputed=np.array([begins], dtype=np.int64))
 
 
 def after_ride(cargo: Cargo, load: FloatArray, variance: FloatArray) -> Cargo:

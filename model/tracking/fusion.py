@@ -32,6 +32,8 @@ HARMLESS = 0.3  # standard deviations of shift by gains and delays at which an u
 QUIET = 5.0  # log-likelihood ratio of a change above which a parameter's windows are not used to learn slopes
 INFORMATIVE = 0.5  # weight of a window below which its scatter comes from noise, not from unmodelled dynamics
 SETTLING = 20.0  # s after a jump of a deviation: until then the belief may have shared it out among channels
+DISPUTED = 1.5  # window lengths for which windows contradict the believed loads before there is another load: a force
+# of a moment is part of two windows, or of three where it takes half of one
 KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
 
 
@@ -77,7 +79,10 @@ class Fusion:
         """State after a usable window, and a deviation that has jumped."""
         belief, elapsed = self._predicted(state, time_ns)
         found = estimate.deviating if self.model.size else None
-        belief, cargo = self._with_loads(state, belief, elapsed, found, conditions)
+        disputed, state = self._disputed(state, belief, elapsed, found, time_ns)
+        if disputed:
+            return replace(state, last=time_ns, rejected=state.rejected + 1, belief=belief), None
+        belief, cargo = self._with_loads(state, belief, elapsed, conditions)
         share, weight = min(1.0, elapsed / self.settings.window), noise_weight(estimate.noise)
         belief, calibration, found, jump, agrees = self._with_deviations(
             state.calibration, belief, found, time_ns, (share, weight)
@@ -216,15 +221,30 @@ class Fusion:
         weather = weathers.update_slopes(weather, self.weather, residual, variance, quiet, at, window.centre, seconds)
         return weather, tested
 
+    def _disputed(
+        self, state: TrackerState, belief: kalman.Belief, elapsed: float, found: Deviating | None, time_ns: int
+    ) -> tuple[bool, TrackerState]:
+        """Whether a window contradicts the believed loads and is passed over, and the state with that noted.
+
+        What lasts for a moment is no load but a force that nobody measures, as where a curve begins or ends.
+        """
+        cargo = state.cargo
+        if cargo is None or not len(self.model.loads_at):
+            return False, state
+        rides = state.last is not None and elapsed - self.settings.window <= dev.STOPPED
+        contradicting = rides and found is not None and dev.loads_changed(belief, self.model, found)
+        cargo = cargos.disputed(cargo, time_ns, contradicting=contradicting)
+        lasts = (time_ns - int(cargo.disputed[0])) * 1e-9 >= DISPUTED * self.settings.window
+        return contradicting and not lasts, replace(state, cargo=cargo)
+
     def _with_loads(
         self,
         state: TrackerState,
         belief: kalman.Belief,
         elapsed: float,
-        found: Deviating | None,
         conditions: Conditions | None,
     ) -> tuple[kalman.Belief, Cargo | None]:
-        """Loads return to their prior after a stop or where a window contradicts them; pressures, if any, refine it."""
+        """Loads return to their prior after a stop or where windows contradict them; pressures, if any, refine it."""
         model, cargo = self.model, state.cargo
         if not model.size or cargo is None or not len(model.loads_at):
             return belief, cargo
@@ -232,8 +252,7 @@ class Fusion:
         believed = belief.mean[rows], np.diag(belief.covariance)[rows]
         prior, pressure = np.diag(model.prior)[model.loads], _pressure(conditions, len(rows))
         departs = elapsed - self.settings.window > dev.STOPPED
-        known_before = not departs and state.last is not None
-        changed = known_before and found is not None and dev.loads_changed(belief, model, found)
+        changed = bool(cargo.disputed[0])
         contradicted = not (departs or changed) and cargos.contradicted(cargo, *believed, prior)
         if not (departs or changed or contradicted):
             return belief, cargos.during_ride(cargo, pressure)

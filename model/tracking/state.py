@@ -191,7 +191,9 @@ def _cargo(data: Mapping[str, Any]) -> Cargo | None:
         return None
     arrays = _unpack_all(data["cargo"])
     zeros = np.zeros(len(arrays["constant"]))
-    later = {"scatter": zeros, "past": zeros, "past_variance": zeros, "past_at": zeros.astype(np.int64)}
+    never = zeros.astype(np.int64)
+    later = {"scatter": zeros, "past": zeros, "past_variance": zeros, "past_at": never}
+    later["disputed"] = np.zeros(1, dtype=np.int64)
     return Cargo(**later | arrays)
 
 

@@ -224,6 +224,9 @@ class Tracker:
         weather = state.weather
         if weather is not None:
             weather = replace(weather, began=np.where(weather.began != 0, weather.began + shift, 0))
+        cargo = state.cargo
+        if cargo is not None:
+            cargo = replace(cargo, disputed=np.where(cargo.disputed != 0, cargo.disputed + shift, 0))
         return replace(
             state,
             time=state.time + shift,
@@ -242,6 +245,7 @@ class Tracker:
             ),
             stuck=tuple(replace(s, since=s.since + shift) for s in state.stuck),
             weather=weather,
+            cargo=cargo,
         )
 
     def update_many(self, state: TrackerState, windows: Iterable[tuple[Estimate, int]]) -> TrackerState:

@@ -1,5 +1,6 @@
 """Gains, delays, loads and broken sensors: what windows say of them, and that no spring is blamed for them."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
 
-from sprung.model.identification.deviations import clock_groups, deviations
+from sprung.model.identification.deviations import clock_groups, deviations, nodes
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.identification.refine import Refiner
@@ -84,6 +85,13 @@ def test_every_channel_may_deviate_and_channels_of_one_message_share_a_clock(sys
     ]  # fmt: skip
     groups = clock_groups(system)
     assert len(set(groups[BOGIE])) == 1 and len(set(groups)) == 7
+
+
+def test_channels_without_messages_share_a_clock_and_a_node_where_they_are_measured(system: System) -> None:
+    text = re.sub(r"mcap: [^,]*, can: ([^,}]*)", r"csv: \1", MANCHESTER.read_text("utf-8"))
+    table = parse_system(text)
+    assert not any(channel.mcap or channel.can for channel in table.channels)
+    assert (clock_groups(table) == clock_groups(system)).all() and (nodes(table) == nodes(system)).all()
 
 
 def test_the_estimate_moves_with_a_gain_as_the_sensitivities_say(system: System) -> None:

@@ -90,6 +90,29 @@ def test_a_step_of_the_load_raises_nothing_and_is_known_within_half_a_minute(ste
     assert tracker.health(state) == "ok"
 
 
+def test_a_moment_that_looks_like_another_load_moves_neither_load_nor_springs() -> None:
+    rng, tracker = np.random.default_rng(21), follow()
+    state = ride(rng, tracker, tracker.initial_state(), 60, constant(0.1))
+    before, used = tracker.loads(state)["car"], state.used
+    level = tracker.posterior(state)[0]
+    bent = ride(rng, tracker, state, 2, constant(0.4), 60)  # as where a curve begins
+    assert bent.used == used and bent.rejected == 2
+    assert tracker.loads(bent)["car"][0] == pytest.approx(before[0])
+    assert np.abs(tracker.posterior(bent)[0] - level).max() < 1e-3
+    straight = ride(rng, tracker, bent, 10, constant(0.1), 62)
+    assert straight.rejected == 2
+    assert tracker.loads(straight)["car"] == pytest.approx((0.1, 0.004), abs=0.01)
+
+
+def test_a_clock_that_steps_back_leaves_no_load_in_dispute() -> None:
+    rng, tracker = np.random.default_rng(22), follow()
+    state = ride(rng, tracker, tracker.initial_state(), 61, lambda k: 0.1 if k < 60 else 0.4)
+    assert state.rejected == 1
+    back = tracker.rebase(state, EPOCH - 3600 * SECOND)
+    moved = ride(rng, tracker, back, 10, constant(0.4), -3600)
+    assert tracker.loads(moved)["car"][0] == pytest.approx(0.4, abs=0.02)
+
+
 def test_more_than_the_car_may_carry_is_an_alarm_until_it_is_let_down() -> None:
     rng = np.random.default_rng(2)
     tracker = follow(most=6000.0)
