@@ -180,7 +180,7 @@ def judge(
     weigh = np.arange(len(windows)) % WEIGHED_OF == 0
     state = tracker.initial_state()
     for batch in np.array_split(np.arange(len(windows)), max(1, len(windows) // 64)):
-        known = [tracker.hard_faults(state)] * len(batch)
+        known = [tracker.known_faults(state)] * len(batch)
         for i, estimate in zip(batch, identifier.examine(windows[batch], weigh[batch], known), strict=True):
             state = tracker.update(state, estimate, START + round(firsts[i] / system.sample_rate * 1e9))
     named = fault is not None and _is_named(system, tracker, state, fault)

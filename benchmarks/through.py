@@ -36,7 +36,7 @@ def through(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Iterator[
     rate, state = system.sample_rate, tracker.initial_state()
     for windows, begins in _windows(engine, vehicle, timetable):
         starts = [START + round(k / rate * 1e9) for k in begins]
-        known = [tracker.hard_faults(state)] * len(windows)
+        known = [tracker.known_faults(state)] * len(windows)
         found, _ = engine.identify(windows, starts=starts, known=known)
         for k, start, estimate in zip(begins, starts, found, strict=True):
             before, state = state, tracker.update(state, estimate, start)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -280,9 +280,7 @@ class Explainer:
 
     def _refined(self, windows: FloatArray, point: FloatArray, loads: BoolArray) -> list[Refined]:
         """Corrected windows refined, with their evidence; one `Refined` of one window each."""
-        C = self.channels
-        late = np.abs(point[:, C : 2 * C]).max(axis=1, initial=0.0) * self.system.sample_rate
-        margin = np.where(late > 0, np.ceil(late).astype(int) + _MARGIN, 0)
+        margin = self.margin(point)
         out: list[Refined | None] = [None] * len(windows)
         for edge in np.unique(margin):
             for with_loads in (False, True):
@@ -304,15 +302,56 @@ class Explainer:
                     out[row] = refined.take(np.array([k]))
         return [one for one in out if one is not None]
 
+    def points(self, known: Sequence[tuple[MeasurementFault, ...]], windows: int) -> FloatArray:
+        """The gains and delays among what is known of each of some windows as deviations, (B, H)."""
+        C, points = self.channels, np.zeros((windows, len(self.deviations)))
+        made: dict[tuple[MeasurementFault, ...], FloatArray] = {}
+        for b, faults in enumerate(known):
+            if faults not in made:
+                made[faults] = np.zeros(len(self.deviations))
+                for fault in faults:
+                    columns = [self.names.index(name) for name in fault.channel.split("|")]
+                    if fault.kind == "gain":
+                        made[faults][columns] = fault.value - 1
+                    elif fault.kind == "delay":
+                        made[faults][C + np.array(columns)] = fault.value
+            points[b] = made[faults]
+        return points
+
+    def margin(self, point: FloatArray) -> IntArray:
+        """Samples at either end that delays taken back (B, H) leave nothing right of, (B,)."""
+        C = self.channels
+        late = np.abs(point[:, C : 2 * C]).max(axis=1, initial=0.0) * self.system.sample_rate
+        return np.where(late > 0, np.ceil(late).astype(np.int64) + _MARGIN, 0)
+
+    def together(self, before: FloatArray, cause: FaultExplanation) -> FaultExplanation:
+        """The explanation of a window from which the deviations `before` (H,) had been taken back already."""
+        if not before.any():
+            return cause
+        C, point, before = self.channels, cause.point.copy(), before.copy()
+        for fault in cause.faults:
+            columns = [self.names.index(name) for name in fault.channel.split("|")]
+            if fault.kind == "swapped" and len(columns) == 2:  # columns were put right, then exchanged
+                for part in (before[:C], before[C : 2 * C]):
+                    part[columns] = part[columns[::-1]]
+        more = np.abs(cause.point) > 0
+        point[:C] = (1 + before[:C]) * (1 + point[:C]) - 1
+        point[C : 2 * C] += before[C : 2 * C]
+        hard = [f for f in cause.faults if f.kind not in ("gain", "delay")]
+        return replace(cause, point=point, faults=(*hard, *self._named(np.where(more & self._measured, point, 0.0))))
+
     def corrected(self, windows: FloatArray, point: FloatArray) -> FloatArray:
         """Windows (B, T, C) with gains divided out and delays taken back; at the ends a delay leaves nothing right."""
         C = self.channels
         out = windows / (1 + point[:, None, :C])
         time = np.arange(windows.shape[1]) / self.system.sample_rate
-        for b, c in zip(*np.nonzero(point[:, C : 2 * C]), strict=True):
-            if np.isfinite(out[b, :, c]).all():
-                at = np.clip(time + point[b, C + c], 0, time[-1])
-                out[b, :, c] = make_interp_spline(time, out[b, :, c], k=7)(at)
+        for c in np.flatnonzero(point[:, C : 2 * C].any(axis=0)).tolist():
+            late = point[:, C + c]
+            whole = np.isfinite(out[:, :, c]).all(axis=1) & (np.ptp(out[:, :, c], axis=1) > 0)  # frozen ones stay so
+            for size in np.unique(late[whole & (late != 0)]):
+                rows = np.flatnonzero(whole & (late == size))
+                at = np.clip(time + size, 0, time[-1])
+                out[rows, :, c] = make_interp_spline(time, out[rows, :, c].T, k=7)(at).T
         return np.asarray(out)
 
     def _step(self, score: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,10 @@ from sprung.model.identification.deviations import deviations
 from sprung.model.identification.estimates import EXCITED, estimates
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.faults import Explainer, FaultExplanation
+from sprung.model.identification.faults import Explainer, FaultExplanation, fits
 from sprung.model.identification.linearise import PRIOR_STD, prior_std
 from sprung.model.identification.model_uncertainty import ModelUncertainty, model_uncertainty
-from sprung.model.identification.refine import Refined, Refiner, Refines
+from sprung.model.identification.refine import Refined, Refiner, Refines, in_order
 from sprung.model.identification.with_laws import LawRefiner, acting_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray, IntArray, MeasurementFault
@@ -27,6 +28,8 @@ from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
 from sprung.model.work import WorkBudget
 
+MANY = 24  # windows of a batch without start values, from which on some are refined first to start the others
+PILOTS = 6  # of these; their median is near, since batches are of one vehicle for the most part
 NOT_EXPLAINED = "whether a measurement is wrong was not looked into to the end: it takes longer than "
 
 
@@ -97,34 +100,65 @@ class Identifier:
         delays, and a wrong measurement is looked for where windows do not fit (`model.identification.faults`).
 
         known: frozen, reversed and exchanged channels that earlier windows of the vehicle had, for each window: where
-        a window has them again, nothing else is tried.  windows, start: see `identify`.
+        a window has them again, nothing else is tried; and gains and delays, which are taken back first, so that what
+        a window says of measurements is linear in what is left of them.  windows, start: see `identify`.
         """
         windows = self.system.undistorted(self._checked(windows))
         if len(windows) == 0:
             return []
         begin = time.perf_counter()
         self._allow(windows)
+        faults = [tuple(f for f in its if f.kind not in ("gain", "delay")) for its in known] or [()] * len(windows)
+        explainer, whole = self._explainer(windows.shape[1]), np.empty(len(windows), dtype=object)
+        points, estimating = explainer.points(known, len(windows)), 0.0
+        for edge in np.unique(explainer.margin(points)):
+            rows = np.flatnonzero(explainer.margin(points) == edge)
+            right = explainer.corrected(windows[rows], points[rows]) if points[rows].any() else windows[rows]
+            started = time.perf_counter()
+            its_start = self._start(right, None if start is None else start[rows], loads=bool(self.system.loads))
+            estimating += time.perf_counter() - started
+            inner = right[:, edge : windows.shape[1] - edge]
+            whole[rows] = self._examined(
+                inner, weigh[rows], [faults[b] for b in rows.tolist()], its_start, points[rows]
+            )
+        self.times = StageTimes(estimating, time.perf_counter() - begin - estimating)
+        return list(whole)
+
+    def _examined(
+        self,
+        windows: FloatArray,
+        weigh: BoolArray,
+        known: Sequence[tuple[MeasurementFault, ...]],
+        start: FloatArray | None,
+        points: FloatArray,
+    ) -> list[Estimate]:
+        """Windows (B, T, C) from which the deviations `points` (B, H) have been taken back; known: hard faults."""
         explainer = self._explainer(windows.shape[1])
-        explained, contradicted = self._explained_beforehand(windows, known, explainer)
+        moved = self._refiner(windows.shape[1]).model.excitation(windows) > EXCITED
+        explained, contradicted = self._explained_beforehand(windows, known, explainer, moved)
         plain = _left(np.arange(len(windows)), explained)
-        found, estimating = self._plainly(windows[plain], weigh[plain], None if start is None else start[plain])
+        its_start = None if start is None else start[plain]
+        found = self._plainly(windows[plain], weigh[plain], its_start, points[plain], moved[plain])
         asks = contradicted[plain] | np.array([e.informative and self._asks(e, explainer) for e in found], dtype=bool)
         explained |= explainer.explain(windows, plain[asks])
-        whole = dict(zip(plain.tolist(), found, strict=True)) | {b: self._restored(e) for b, e in explained.items()}
+        whole = dict(zip(plain.tolist(), found, strict=True))
+        whole |= {b: self._restored(explainer.together(points[b], e)) for b, e in explained.items()}
         for b in _left(plain, explained).tolist():
             if not whole[b].informative:
                 whole[b] = replace(whole[b], faults=explainer.stuck.all_inputs(windows[b]))
         if self._work.ended:
             whole |= {b: self._as_far_as_looked_into(whole[b]) for b in [*explained, *plain[asks].tolist()]}
-        self.times = StageTimes(estimating, time.perf_counter() - begin - estimating)
         return [whole[b] for b in range(len(windows))]
 
     def _explained_beforehand(
-        self, windows: FloatArray, known: Sequence[tuple[MeasurementFault, ...]], explainer: Explainer
+        self,
+        windows: FloatArray,
+        known: Sequence[tuple[MeasurementFault, ...]],
+        explainer: Explainer,
+        moved: BoolArray,
     ) -> tuple[dict[int, FaultExplanation], BoolArray]:
         """Windows, by index, with the faults that their vehicle had before or with redundant channels that contradict
-        each other, put right; and which windows contain such a contradiction, (B,)."""
-        moved = self._refiner(windows.shape[1]).model.excitation(windows) > EXCITED
+        each other, put right; and which windows contain such a contradiction, (B,).  moved: by their inputs, (B,)."""
         explained = explainer.again(windows, {b: its for b, its in enumerate(known) if its and moved[b]})
         contradicted = moved & explainer.contradictions.contradicted(windows)
         explained |= explainer.contradictory(windows, _left(np.flatnonzero(contradicted), explained))
@@ -136,19 +170,41 @@ class Identifier:
             return replace(estimate, reason=NOT_EXPLAINED + self._limit)
         return estimate
 
-    def _plainly(self, windows: FloatArray, weigh: BoolArray, start: FloatArray | None) -> tuple[list[Estimate], float]:
-        """Windows (B, T, C) as a tracker wants them, taken for right; and the seconds that their start took."""
+    def _plainly(
+        self, windows: FloatArray, weigh: BoolArray, start: FloatArray | None, points: FloatArray, moved: BoolArray
+    ) -> list[Estimate]:
+        """Windows (B, T, C) as a tracker wants them, taken for right once `points` (B, H) have been taken back.
+
+        moved: whose inputs move, (B,).  The others tell nothing, however long they are refined.
+        """
         if len(windows) == 0:
-            return [], 0.0
-        loads, built, begin = bool(self.system.loads), bool(self.system.built), time.perf_counter()
-        start = self._start(windows, start, loads=loads)
-        estimating = time.perf_counter() - begin
-        refined = self._refiner(windows.shape[1]).refine(windows, start, loads=loads, built=built, weigh=weigh)
-        return self._estimates(refined, False), estimating
+            return []
+        refiner, loads, built = self._refiner(windows.shape[1]), bool(self.system.loads), bool(self.system.built)
+        parts: list[tuple[IntArray, Refined]] = []
+
+        def refine(rows: IntArray, begin: FloatArray | None, along: partial[Refined]) -> Refined:
+            parts.append((rows, along(windows[rows], begin, weigh=weigh[rows] & moved[rows])))
+            return parts[-1][1]
+
+        linear, fully = isinstance(refiner, Refiner), partial(refiner.refine, loads=loads, built=built)
+        stands = np.flatnonzero(~moved) if linear else np.zeros(0, dtype=np.int64)
+        rides = np.setdiff1d(np.arange(len(windows)), stands)
+        if len(stands):
+            refine(stands, None if start is None else start[stands], partial(fully, iterations=1))
+        if start is None and linear and len(rides) >= MANY:
+            pilots = rides[np.linspace(0, len(rides) - 1, PILOTS).astype(np.int64)]
+            first, rides = refine(pilots, None, fully), np.setdiff1d(rides, pilots)
+            good = fits(first)
+            near = np.median(first.log_ratio[good], axis=0) if good.any() else np.zeros(first.log_ratio.shape[1])
+            refine(rides, np.tile(near, (len(rides), 1)), fully)
+        elif len(rides):
+            refine(rides, None if start is None else start[rides], fully)
+        refined = in_order([part for _, part in parts], np.concatenate([rows for rows, _ in parts]))
+        return self._estimates(refined, False, points)
 
     def _restored(self, cause: FaultExplanation) -> Estimate:
         """The estimate of a window whose measurements were put right."""
-        (restored,) = self._estimates(cause.refined, False, cause.point)
+        (restored,) = self._estimates(cause.refined, False, cause.point[None])
         fitting, known = restored.adequate and cause.corrected, restored.identified or bool(cause.faults)
         return replace(self._averaged(restored), faults=cause.faults, adequate=fitting, identified=known)
 
@@ -162,12 +218,13 @@ class Identifier:
             return start
         return self.estimator.start(windows, self.workers, loads=loads)
 
-    def _estimates(self, refined: Refined, states: bool, point: FloatArray | None = None) -> list[Estimate]:
-        """point: deviations (H,) that were taken back from the samples before."""
+    def _estimates(self, refined: Refined, states: bool, points: FloatArray | None = None) -> list[Estimate]:
+        """points: deviations (B, H) that were taken back from the samples before."""
         P = len(self.system.tracked)
         spread = prior_std(self.system)[len(self.system.parameters) :]
         channels = len(self.system.channels)
-        deviating = [_deviating(refined, b, P, channels, spread, point) for b in range(len(refined.log_ratio))]
+        point = [None if points is None or not points[b].any() else points[b] for b in range(len(refined.log_ratio))]
+        deviating = [_deviating(refined, b, P, channels, spread, at) for b, at in enumerate(point)]
         return estimates(refined, P, states, deviating, self._limit)
 
     @property
@@ -316,7 +373,7 @@ def _deviating(
     """
     X = refined.log_ratio.shape[1] - P  # of loads and bodies' own that were refined along
     whole = bool(refined.weighed[b])
-    if not (whole or X > 0):
+    if not (whole or X > 0) and point is None:
         return None
     C, H = channels, 2 * channels + len(spread)
     at, covariance = np.zeros(H) if point is None else point.copy(), refined.covariance[b]

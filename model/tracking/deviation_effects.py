@@ -33,7 +33,8 @@ class DeviationEffects:
         """Whether a window without sensitivities of its own is shifted too far for a correction by mean ones."""
         if not self.model.size or (estimate.deviating is not None and estimate.deviating.whole):
             return False
-        shift = state.calibration.cross @ np.where(self.model.refined, 0, state.belief.mean[-self.model.size :])
+        point = np.zeros(self.model.size) if estimate.deviating is None else estimate.deviating.point
+        shift = self.channel_shift(state.calibration.cross, state.belief, point)
         return bool(np.any(np.abs(shift) > LINEAR_SHIFT * np.sqrt(estimate.covariance.diagonal())))
 
     def chi_square(self, state: TrackerState, estimate: Estimate) -> float:
@@ -67,12 +68,12 @@ class DeviationEffects:
         else:
             found_at, cross, covariance = found.point, found.cross, found.given
         if found is None or not found.whole:
-            covariance = _with_cross_error(covariance, self.channel_shift(cross, belief))
+            covariance = _with_cross_error(covariance, self.channel_shift(cross, belief, found_at))
         return value + np.where(mask, cross @ (here - found_at), 0.0), covariance, cross
 
-    def channel_shift(self, cross: FloatArray, belief: kalman.Belief) -> FloatArray:
-        """Shift (P,) of the log-ratios by the believed gains and delays."""
-        return np.asarray(cross @ np.where(self.model.refined, 0.0, belief.mean[-self.model.size :]))
+    def channel_shift(self, cross: FloatArray, belief: kalman.Belief, point: FloatArray) -> FloatArray:
+        """Shift (P,) of log-ratios that were found at the deviations `point` (H,) by the believed gains and delays."""
+        return np.asarray(cross @ np.where(self.model.refined, 0.0, belief.mean[-self.model.size :] - point))
 
     def variance(self, belief: kalman.Belief, cross: FloatArray, chosen: BoolArray) -> FloatArray:
         """Variance (P,) of a window's values that the uncertainty of the `chosen` deviations (H,) contributes."""

@@ -24,6 +24,7 @@ CLOCK_WALK = 2e-5  # s per sqrt(s), of a node's clock; 1.2 ms in an hour
 CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre": 1e-4, "side": 1e-4}
 OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
 REPORT_LIMIT = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is within the tolerance of electronics
+PUT_RIGHT = {"gain": 0.005, "delay": 8e-4}  # from which it is taken back from samples; a delay costs their ends
 DRIFT_LIMIT = {"gain": 0.03, "delay": 2e-3}  # a slow drift beyond it is an alarm: electronics age by 2 % a month
 
 
@@ -104,6 +105,11 @@ class DeviationModel:
     def report_limit(self) -> FloatArray:
         """Size from which each deviation is reported, (H,); infinite for loads."""
         return np.array([REPORT_LIMIT.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
+
+    @cached_property
+    def put_right(self) -> FloatArray:
+        """Size from which each deviation is taken back from samples, (H,); infinite for loads."""
+        return np.array([PUT_RIGHT.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
 
     @cached_property
     def channel_directions(self) -> BoolArray:

@@ -141,12 +141,12 @@ class Fusion:
         if found is None:
             return belief, calibration, None, None, True
         if not found.whole:
-            shift = self.effects.channel_shift(calibration.cross, belief)
+            shift = self.effects.channel_shift(calibration.cross, belief, found.point)
             doubt = 1 + float((shift**4 / found.given.diagonal() ** 2).max()) / HARMLESS**4
             # its load was estimated with gains and delays as the system file states them
             belief = dev.update_loads(belief, model, found, share * weight / doubt)
             cross = np.where(model.refined, found.cross, calibration.cross)
-            found = replace(found, cross=cross, point=np.where(model.refined, found.point, 0.0))
+            found = replace(found, cross=cross)
             return belief, calibration, found, None, True
         elapsed = (time_ns - int(calibration.recent[-1])) * 1e-9
         part = min(1.0, elapsed / self.settings.window) * weight

@@ -296,6 +296,24 @@ class Tracker:
         reported = (s for s in state.stuck if s.count >= HARD_FAULT_WINDOWS)
         return tuple(MeasurementFault(s.channel, s.kind, s.value) for s in reported)
 
+    def known_faults(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
+        """What identification should put right before it looks at a window: hard faults, gains and large delays.
+
+        What windows say is linear in gains and delays near those that were taken back; far from them it must be
+        refined once more, which costs several times as much.
+        """
+        hard, H = self.hard_faults(state), self.model.size
+        exchanged = any(fault.kind == "swapped" for fault in hard)  # of which channel a gain is, is another question
+        if H == 0 or state.calibration.recent[-1] == 0 or exchanged:
+            return hard
+        value = state.belief.mean[-H:]
+        off = value - self.model.common_value(value)
+        far = np.abs(off) > self.model.put_right
+        chosen = np.zeros(H, dtype=bool)
+        for at in self.model.groups:  # all or none: differences between channels are what windows tell
+            chosen[at] = far[at].any()
+        return (*hard, *named(self.deviations, off, np.zeros(H), chosen))
+
     def sensors(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
         """Sensor faults: stuck channels, and gains and delays that differ from the system file."""
         stuck = self.hard_faults(state)

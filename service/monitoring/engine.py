@@ -73,7 +73,7 @@ class Engine:
         """Estimates of windows, values of shape (B, T, C), and the seconds they took by stage.
 
         starts: ns, of windows that will be tracked: measurements that are wrong are looked for, too.
-        known: of each such window, `Tracker.hard_faults` of its vehicle, which spares looking for these anew.
+        known: of each such window, `Tracker.known_faults` of its vehicle, which spares looking for these anew.
         """
         if starts is None:
             estimates = self.identifier.identify(values, states=states)

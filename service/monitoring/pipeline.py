@@ -136,7 +136,7 @@ class Pipeline:
         """Of a vehicle's measurements, as far as its tracker is in memory; see `Engine.identify`."""
         with self._lock:
             held = self._vehicles.get(vehicle)
-        return () if held is None or held.served is not served else served.engine.tracker.hard_faults(held.state)
+        return () if held is None or held.served is not served else served.engine.tracker.known_faults(held.state)
 
     def _identify(
         self, vehicle: str, served: ServedModel, windows: list[Window], priority: Priority

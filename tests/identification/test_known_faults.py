@@ -7,7 +7,9 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from scipy.interpolate import make_interp_spline
 
+from sprung.model.identification.deviations import deviations
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
 from sprung.model.identification.refine import Refiner
@@ -117,3 +119,80 @@ def test_a_known_exchange_that_contradicts_nothing_is_undone_while_it_lasts() ->
         found = identifier.examine(wrong, np.zeros(2, dtype=bool), known)
     assert sizes == [2] and [e.faults for e in found] == known
     assert not any(e.faults for e in identifier.examine(right, np.zeros(2, dtype=bool), known))
+
+
+def wrong(samples: FloatArray) -> tuple[FloatArray, Faults]:
+    """A gain of 4 % and all of a clock 2 ms late, and how a tracker knows of them."""
+    gained, names = samples.copy(), [channel.name for channel in load_system().channels]
+    gained[:, 20] *= 1.04
+    time = np.arange(len(samples)) / 100
+    late = range(16, 20)
+    for c in late:
+        gained[:, c] = make_interp_spline(time, samples[:, c], k=7)(np.clip(time - 0.002, 0, None))
+    clock = MeasurementFault("|".join(names[c] for c in late), "delay", 0.002)
+    return gained, (MeasurementFault("bogie1_1l", "gain", 1.04), clock)
+
+
+def test_known_gains_and_delays_are_taken_back_without_a_search(system: System, samples: FloatArray) -> None:
+    gained, faults = wrong(samples)
+    values, right = windows(system, gained, hop=100)[1:4], windows(system, samples, hop=100)[1:4]
+    weigh, identifier = np.array([True, False, True]), Identifier(system)
+    with counted() as sizes:
+        found = identifier.examine(values, weigh, [faults] * 3)
+    assert sizes == [3]
+    whole = identifier.examine(right, weigh)
+    for one, clean in zip(found, whole, strict=True):
+        assert one.adequate and not one.faults and one.deviating is not None
+        assert one.deviating.point[[20, 28 + 16, 28 + 19, 0]] == pytest.approx([0.04, 0.002, 0.002, 0.0])
+        assert one.deviating.whole == (clean.deviating is not None and clean.deviating.whole)
+        off = (one.log_ratio - clean.log_ratio) / np.sqrt(clean.covariance.diagonal())
+        assert np.abs(off).max() < 1.5  # the ends of the window are missing
+
+
+def test_what_windows_say_of_a_gain_does_not_depend_on_what_was_taken_back(system: System, samples: FloatArray) -> None:
+    gained = samples.copy()
+    gained[:, 20] *= 1.02
+    values, identifier = windows(system, gained, hop=100)[1:4], Identifier(system)
+    told = []
+    for known in ((), (MeasurementFault("bogie1_1l", "gain", 1.03),)):
+        found = [e.deviating for e in identifier.examine(values, np.ones(3, dtype=bool), [known] * 3)]
+        information = np.diag([d.std**-2 for d in deviations(system)])
+        pull = np.zeros(len(information))
+        for one in found:
+            assert one is not None
+            information += one.information
+            pull += one.score + one.information @ one.point
+        told.append((np.linalg.solve(information, pull)[20], np.linalg.inv(information)[20, 20] ** 0.5))
+    (plain, std), (near, _) = told
+    assert near == pytest.approx(plain, abs=0.3 * std)
+    assert plain == pytest.approx(0.02, abs=3 * std)
+
+
+def test_a_gain_taken_back_before_an_exchange_is_found_is_that_of_the_right_channel(
+    system: System, samples: FloatArray
+) -> None:
+    """Columns 20 and 22 are exchanged; the tracker knew a gain of the first, which is in the second column now."""
+    exchanged = samples.copy()
+    exchanged[:, 20], exchanged[:, 22] = samples[:, 22], 1.03 * samples[:, 20]
+    values = windows(system, exchanged, hop=100)[1:3]
+    known: list[Faults] = [(MeasurementFault("bogie1_1l", "gain", 1.03),)] * 2
+    for one in Identifier(system).examine(values, np.ones(2, dtype=bool), known):
+        assert next(f.kind for f in one.faults) == "swapped"
+        assert one.deviating is not None
+        seen = one.deviating.point + np.linalg.pinv(one.deviating.information, rcond=1e-6) @ one.deviating.score
+        assert one.deviating.point[20] == pytest.approx(0.03, abs=0.02) or abs(seen[20] - 0.03) < 0.02
+
+
+def test_standing_windows_are_refined_once_and_the_first_of_many_start_the_others(
+    system: System, samples: FloatArray
+) -> None:
+    moving, identifier = windows(system, samples, hop=20)[:25], Identifier(system)
+    standing = 1e-5 * np.random.default_rng(3).standard_normal((3, *moving.shape[1:]))
+    with counted() as sizes:
+        found = identifier.examine(np.concatenate([standing, moving]), np.zeros(28, dtype=bool))
+    assert sizes == [3, 6, 19]
+    assert [e.informative for e in found] == [False] * 3 + [True] * 25
+    alone = identifier.examine(moving[:20], np.zeros(20, dtype=bool))
+    for one, other in zip(found[3:], alone, strict=False):
+        off = (one.log_ratio - other.log_ratio) / np.sqrt(other.covariance.diagonal())
+        assert np.abs(off).max() < 0.2

@@ -12,6 +12,7 @@ from sprung.model.identification.deviations import Deviation
 from sprung.model.signals import Deviating, Estimate, FloatArray
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking.deviation_model import DRIFT_LIMIT, model_of
+from sprung.model.tracking.state import Stuck
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from tests.tracker_windows import EPOCH, TrackedParameter, correlated, estimate
 
@@ -276,3 +277,20 @@ def test_the_baseline_keeps_its_gains_and_delays_while_a_jump_may_still_be_share
 
 def _references(before: TrackerState, after: TrackerState) -> tuple[FloatArray, FloatArray]:
     return before.calibration.reference, after.calibration.reference
+
+
+def test_identification_is_told_all_gains_or_none_and_all_delays_or_none() -> None:
+    tracker = make([Deviation(f"c{i}", "gain", 0.015, i) for i in range(4)] + DELAYS)
+    state = tracker.initial_state()
+    assert tracker.known_faults(state) == ()
+    mean = state.belief.mean.copy()
+    mean[-8:] = [0.02, 0.001, -0.002, 0.0, 1e-4, 0.0, 2e-4, 0.0]
+    calibration = replace(state.calibration, recent=np.full(3, EPOCH))
+    state = replace(state, belief=replace(state.belief, mean=mean), calibration=calibration)
+    known = tracker.known_faults(state)
+    assert [(f.channel, f.kind) for f in known] == [(f"c{i}", "gain") for i in range(4)]
+    assert known[0].value == pytest.approx(1.0195)  # relative to the median of all
+    stuck = replace(state, stuck=(Stuck("c1", "frozen", 0.0, 6, EPOCH),))
+    assert [f.kind for f in tracker.known_faults(stuck)] == ["frozen", *["gain"] * 4]
+    exchanged = replace(state, stuck=(Stuck("c0|c1", "swapped", 0.0, 6, EPOCH),))
+    assert [f.kind for f in tracker.known_faults(exchanged)] == ["swapped"]
