@@ -169,3 +169,11 @@ def test_hysteresis_that_stiffens_while_it_is_loaded_is_of_the_bouc_wen_family()
     assert (finding.location, finding.effect) == ("spring", "bouc_wen")
     for parameter, truth in zip(finding.parameters, (alpha, beta, 1.0, gamma), strict=True):
         assert abs(parameter.value - truth) < max(4 * parameter.std, 0.03 * abs(truth)), parameter
+
+
+@pytest.mark.parametrize("samples", [200, 220, 250])
+def test_the_shortest_recordings_with_a_measured_force_are_diagnosed(samples: int) -> None:
+    """Their held-out part has fewer bins than a block of the evidence."""
+    record = simulate(lambda d, v, z: 1e9 * d**3, seconds=samples / RATE)
+    report = diagnose(parse_system(SYSTEM), record, Options())
+    assert [(f.location, f.effect) for f in report.findings] == [("spring", "cubic_stiffness")]
