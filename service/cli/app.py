@@ -82,19 +82,9 @@ def replay(
     Without --store nothing is kept: every run then depends on its files alone.
     """
     one_thread_each()
-    from sprung.service.cli.replay import run
+    from sprung.service.cli.replay import ReplayOptions, run
 
-    return run(
-        files,
-        system=system,
-        dbc=dbc,
-        store=store,
-        weights=weights,
-        vehicle=vehicle,
-        speed=speed,
-        start=start,
-        json_lines=json_lines,
-    )
+    return run(files, ReplayOptions(system, dbc, store, weights, vehicle, speed, start, json_lines))
 
 
 @app.command()

@@ -8,7 +8,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,66 +32,52 @@ from sprung.service.monitoring.views import (
     vehicle_view,
     window_dict,
 )
-from sprung.service.processes.worker import ProcessLimits
-from sprung.service.settings import settings_with
+from sprung.service.settings import Settings, settings_with
 from sprung.service.sources.feed import FeedResult, comfort_dict, feed_file
-from sprung.service.store import Store, open_store, work
+from sprung.service.store import open_store, work
 from sprung.service.times import to_iso
 
 SLACK_SECONDS = 3.0  # to start
 KEPT_UP = 0.9  # of the speed asked for
 
 
-def run(
-    files: list[Path],
-    *,
-    system: Path | None,
-    dbc: Path | None,
-    store: str | None,
-    weights: Path | None,
-    vehicle: str | None,
-    speed: float,
-    start: str | None,
-    json_lines: bool,
-) -> int:
+@dataclass(frozen=True)
+class ReplayOptions:
+    """How recordings are replayed."""
+
+    system: Path | None
+    dbc: Path | None
+    store: str | None  # None: nothing is kept, and a run depends on its files alone
+    weights: Path | None
+    vehicle: str | None
+    speed: float  # times real time; 0: as fast as possible
+    start: str | None  # when the recordings began
+    json_lines: bool
+
+
+def run(files: list[Path], options: ReplayOptions) -> int:
     """Replay each file; 1 when a vehicle has alarms or a recording was incomplete."""
-    settings = settings_with({"system": system, "dbc": dbc, "store": store, "weights": weights})
+    given = {"system": options.system, "dbc": options.dbc, "store": options.store, "weights": options.weights}
+    settings = settings_with(given)
     for path in files:
         if str(path) != "-":
             readable(path)
-    began = start_time(start, files)
-    status = 0
+    began = start_time(options.start, files)
     with ExitStack() as stack:
-        engine = load_engine(settings)
-        if settings.store is None:  # nothing is kept: a run depends on its files alone
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sprung-"))
-            opened = open_store(f"sqlite:///{folder}/replay.db")
-        else:
-            opened = open_store(settings.store_url)
-        stack.callback(opened.close)
-        compute = Compute(settings.compute_queue)
-        stack.callback(compute.close)
-        pipeline = Pipeline(engine, opened, compute, vehicles_in_memory=settings.vehicles_in_memory)
-        for named in files:
-            path = spooled(named, stack)
-            called = named if path is named else CALLED
-            fed = _replay(
-                pipeline,
-                opened,
-                path,
-                vehicle,
-                speed,
-                settings.batch_windows,
-                own_limits(settings, path),
-                began,
-                json_lines,
-                settings.store is not None,
-            )
-            status = max(status, _report(pipeline, called, fed, json_lines))
-            remark = slower_line(fed, speed)
-            if remark:
-                print(f"sprung: {called}: {remark}", file=sys.stderr)
-    return status
+        pipeline = _pipeline(settings, stack)
+        return max(_replay(pipeline, settings, options, named, began) for named in files)
+
+
+def _pipeline(settings: Settings, stack: ExitStack) -> Pipeline:
+    engine = load_engine(settings)
+    url = settings.store_url
+    if settings.store is None:
+        url = f"sqlite:///{stack.enter_context(tempfile.TemporaryDirectory(prefix='sprung-'))}/replay.db"
+    store = open_store(url)
+    stack.callback(store.close)
+    compute = Compute(settings.compute_queue)
+    stack.callback(compute.close)
+    return Pipeline(engine, store, compute, vehicles_in_memory=settings.vehicles_in_memory)
 
 
 def readable(path: Path) -> None:
@@ -100,31 +86,33 @@ def readable(path: Path) -> None:
         pass
 
 
-def _replay(
-    pipeline: Pipeline,
-    store: Store,
-    path: Path,
-    vehicle: str | None,
-    speed: float,
-    batch_windows: int,
-    limits: ProcessLimits | None,
-    start: int | None,
-    json_lines: bool,
-    keeps: bool,
-) -> FeedResult:
-    system = pipeline.engine.system
+def _replay(pipeline: Pipeline, settings: Settings, options: ReplayOptions, named: Path, start: int | None) -> int:
+    """Replay a file and print the outcome; the exit status of it."""
+    with ExitStack() as stack:
+        path = spooled(named, stack)
+        called = named if path is named else CALLED
+        fed = _fed(pipeline, settings, options, path, start)
+    status = _report(pipeline, called, fed, options.json_lines)
+    remark = slower_line(fed, options.speed)
+    if remark:
+        print(f"sprung: {called}: {remark}", file=sys.stderr)
+    return status
+
+
+def _fed(pipeline: Pipeline, settings: Settings, options: ReplayOptions, path: Path, start: int | None) -> FeedResult:
+    system, store = pipeline.engine.system, pipeline.store
     row = file_row(path)
     with store.write() as connection:
         work.add_recording(connection, row)
     kept = Counter[str]()
     with (
-        reporting_what_is_kept(kept, store.engine.url if keeps else None),
-        progress(path.name, system.hop / system.sample_rate, quiet=json_lines) as show,
+        reporting_what_is_kept(kept, None if settings.store is None else store.engine.url),
+        progress(path.name, system.hop / system.sample_rate, quiet=options.json_lines) as show,
     ):
 
         def on_batch(batch: Batch) -> None:
             kept["windows"] += len(batch.records)
-            if json_lines:
+            if options.json_lines:
                 lines = (json.dumps(window_dict(pipeline.engine, record)) for record in batch.records)
                 sys.stdout.write("\n".join(lines) + "\n")
             show(batch)
@@ -132,12 +120,12 @@ def _replay(
         fed = feed_file(
             pipeline,
             path,
-            vehicle=vehicle,
+            vehicle=options.vehicle,
             recording_id=row.id,
-            batch_windows=batch_windows,
-            speed=speed,
+            batch_windows=settings.batch_windows,
+            speed=options.speed,
             start=start,
-            limits=limits,
+            limits=own_limits(settings, path),
             on_batch=on_batch,
         )
     finish_row(store, row, fed)
