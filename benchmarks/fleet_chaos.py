@@ -70,6 +70,52 @@ class KilledPart:
     kills: int = 0
 
 
+@dataclass(frozen=True)
+class ChaosFleet:
+    """What vehicles send to, and what is killed of it."""
+
+    server: postgres.PostgresServer
+    url: str  # of the store
+    program: str  # nats-server
+    address: str  # of NATS
+    port: int  # of Ray Serve
+    folder: Path
+
+    @property
+    def posting(self) -> tuple[str, ...]:
+        """Vehicles that post to Ray Serve."""
+        return NAMES[VEHICLES // 2 :] if find_spec("ray") else ()
+
+    @property
+    def published(self) -> tuple[str, ...]:
+        """Vehicles that publish to NATS."""
+        return tuple(name for name in NAMES if name not in self.posting)
+
+    def parts(self) -> list[KilledPart]:
+        """Not yet started, but for the database."""
+
+        def kill_server(_: object) -> None:
+            os.kill(self.server.pid(), signal.SIGKILL)
+
+        nats = KilledPart("nats", lambda: _nats(self.program, self.address, self.folder), _kill, self.published)
+        parts = [nats, self._consumer(1), self._consumer(2)]
+        parts.append(KilledPart("postgresql", lambda: _started(self.server), kill_server, NAMES))
+        if self.posting:
+            folder = self.folder / "ray"
+            ray = KilledPart("all of Ray", lambda: _serving(self.port, self.url, folder), _kill_all, self.posting)
+            parts += [ray, *_parts_of(ray)]
+        return parts
+
+    def _consumer(self, number: int) -> KilledPart:
+        folder = self.folder / str(number)
+        return KilledPart(f"consumer {number}", lambda: _worker(self.address, self.url, folder), _kill, self.published)
+
+    def links(self) -> list[tuple[ClosedLink, Sequence[str]]]:
+        """Links, and the vehicles that send over each."""
+        found: list[tuple[ClosedLink, Sequence[str]]] = [(NatsLink(self.address, "chaos"), self.published)]
+        return found + [(HttpLink(f"http://127.0.0.1:{self.port}", None, name), [name]) for name in self.posting]
+
+
 @dataclass
 class ChaosOutcome:
     """What happened."""
@@ -94,27 +140,15 @@ def chaos(minutes: float, every: float) -> Figures:
         watched = open_store(url)
         stack.callback(watched.close)
         address, port = f"nats://127.0.0.1:{_free_port()}", _free_port()
-        posting = NAMES[VEHICLES // 2 :] if find_spec("ray") else ()
-        published = tuple(name for name in NAMES if name not in posting)
-        parts = [
-            KilledPart("nats", lambda: _nats(program, address, folder), _kill, published),
-            KilledPart("consumer 1", lambda: _worker(address, url, folder / "1"), _kill, published),
-            KilledPart("consumer 2", lambda: _worker(address, url, folder / "2"), _kill, published),
-            KilledPart("postgresql", lambda: _started(server), lambda _: os.kill(server.pid(), signal.SIGKILL), NAMES),
-        ]
-        if posting:
-            ray = KilledPart("all of Ray", lambda: _serving(port, url, folder / "ray"), _kill_all, posting)
-            parts += [ray, *_parts_of(ray)]
+        fleet = ChaosFleet(server, url, program, address, port, folder)
+        parts = fleet.parts()
         for part in parts:
             if part.name != "postgresql":
                 part.process = part.start()
                 stack.callback(_end_part, part)
-        rounds = max(1, round(60 * minutes * 2 / MOST_WINDOWS))
-        messages = _messages(engine, rounds)
+        messages = _messages(engine, rounds=max(1, round(60 * minutes * 2 / MOST_WINDOWS)))
         outcome = ChaosOutcome()
-        links: list[tuple[ClosedLink, Sequence[str]]] = [(NatsLink(address, "chaos"), published)]
-        links += [(HttpLink(f"http://127.0.0.1:{port}", None, name), [name]) for name in posting]
-        _ride(links, messages, parts, watched, (60 * minutes, every), outcome)
+        _ride(fleet.links(), messages, parts, watched, (60 * minutes, every), outcome)
         expected = sum(len(m.windows) for m in messages)
         settled = _await(lambda: _count(watched, NAMES) >= expected, 120.0)
         time.sleep(settings.late_seconds + 3.0)  # what waits behind a gap is folded at last
@@ -122,13 +156,17 @@ def chaos(minutes: float, every: float) -> Figures:
         alone = _undisturbed(engine, messages, folder)
         found = differences(alone, watched, engine.digest, list(NAMES))
         alone.close()
-    worst = max((seconds for _, seconds in outcome.recoveries), default=0.0)
     yield {"figure": "minutes", "value": minutes, "kills": {part.name: part.kills for part in parts}}
     yield {"figure": "windows acknowledged to vehicles", "value": expected, "stored": stored, "settled": settled}
     yield {"figure": "windows lost", "value": expected - stored, "target": 0}
     for name in ("windows", "alarms", "states"):
         yield {"figure": f"{name} that differ from the undisturbed run", "value": found[name], "target": 0}
     yield {"figure": "largest difference of posteriors", "value": found["posteriors"], "target": 1e-12}
+    yield from _recoveries(outcome)
+
+
+def _recoveries(outcome: ChaosOutcome) -> Figures:
+    worst = max((seconds for _, seconds in outcome.recoveries), default=0.0)
     yield {
         "figure": "longest recovery after a restart",
         "value": round(worst, 1),
