@@ -179,10 +179,14 @@ class LawSearch:
             covariance[ended] += input_noise_covariance(
                 w, normal.take(ended), steps.take(ended), tangent.take(ended), data.present
             )
-        self.converged[rows], self.covariance[rows], self.states[rows] = done, covariance, motion.states
-        self.diverged[rows] = lost
+        self.converged[rows], self.covariance[rows], self.diverged[rows] = done, covariance, lost
         self.iterations[rows] += 1
+        self._note_motion(rows, motion, data)
+
+    def _note_motion(self, rows: Tensor, motion: SimulatedMotion, data: WindowBatch) -> None:
+        """Note what the windows `rows` show of a simulated motion, and how far it is from what they measured."""
         shown = torch.as_tensor(np.flatnonzero(data.present))
+        self.states[rows] = motion.states
         self.outputs[rows[:, None], :, shown] = motion.outputs.mT
         self.error[rows[:, None], shown] = (data.measured - motion.outputs).square().mean(dim=1).sqrt()
 
@@ -229,21 +233,28 @@ class LawSearch:
         largest = step[:, : self.reported].abs().amax(dim=1, keepdim=True)
         return step * (_STEP_LIMIT / largest.clamp_min(_STEP_LIMIT))
 
+    def _identifiable(self, found: Tensor, std: Tensor) -> tuple[Tensor, FloatArray]:
+        """Which unknowns are identified, (B, U), and the share that noise of the inputs has in the information, (B,).
+
+        found: unknowns of every window; std: their standard deviations.
+        """
+        w, P = self.windows, len(self.windows.system.parameters)
+        identifiable = std < IDENTIFIABLE_STD
+        share, weak = np.zeros(len(found)), (std[:, :P] > WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        if len(weak):
+            chosen = self.data.take(weak)
+            noise = noise_share(w.model, w.model.linearise(found[weak][:, w.linear], chosen), chosen)
+            identifiable[weak, :P] &= noise[:, :P] < NOISE_SHARE
+            share[weak.numpy()] = mean_share(noise[:, :P])
+        return identifiable, share
+
     def _result(self, states: bool) -> Refined:
         w, data = self.windows, self.data
         found, covariance = (
             self.point.unknowns[:, : self.reported],
             self.covariance[:, : self.reported, : self.reported],
         )
-        std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
-        identifiable = std < IDENTIFIABLE_STD
-        P = len(w.system.parameters)
-        share, weak = np.zeros(len(found)), (std[:, :P] > WEAK_STD).any(dim=1).nonzero().squeeze(1)
-        if len(weak):
-            chosen = data.take(weak)
-            noise = noise_share(w.model, w.model.linearise(found[weak][:, w.linear], chosen), chosen)
-            identifiable[weak, :P] &= noise[:, :P] < NOISE_SHARE
-            share[weak.numpy()] = mean_share(noise[:, :P])
+        identifiable, share = self._identifiable(found, torch.diagonal(covariance, dim1=1, dim2=2).sqrt())
         signals = len(w.model.compression.matrix(data.present))
         taken = self.states.shape[2] + len(w.memories) + identifiable.sum(dim=1)
         freedom = 2 * w.model.bins * signals - taken

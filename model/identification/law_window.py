@@ -289,13 +289,9 @@ class LawWindows:
         Q = self.model.compression.matrix(data.present)
         columns, memories = self.unknowns, len(self.memories)
         load, slope, which = self._element_loads(steps, motion, data, smooth)  # (B, T, P'), elements of them
-        P0, S0, P1, S1 = (-(block @ self.model.simulator.H[which].T).unsqueeze(1) for block in steps.force_response)
         linear = slice(len(which))
         excitation = load.new_zeros(B, T - 1, N, columns)
-        excitation[..., linear] = P0 * load[:, :-1, None]
-        excitation[..., linear] += S0 * slope[:, :-1, None]
-        excitation[..., linear] += P1 * load[:, 1:, None]
-        excitation[..., linear] += S1 * slope[:, 1:, None]
+        excitation[..., linear] = self._by_element_loads(steps, load, slope, which)
         by_mass = self._mass_loads(point, steps, motion, data)  # (B, n, T, M)
         masses = self.linear[len(which) :]
         springs = self._spring_loads(steps, motion, data, smooth) if self.loads else None  # (B, E, T, X)
@@ -303,10 +299,7 @@ class LawWindows:
             weight = -self.model.simulator.H.T @ springs.flatten(2)
             by_mass[..., -self.loads :] += weight.view(B, -1, T, self.loads)
         if by_mass.shape[3]:
-            by_slope = self.slope @ by_mass
-            series = (by_mass[:, :, :-1], by_slope[:, :, :-1], by_mass[:, :, 1:], by_slope[:, :, 1:])
-            for gain, values in zip(steps.force_response, series, strict=True):
-                excitation[..., masses] += (gain @ values.flatten(2)).view(B, N, T - 1, -1).transpose(1, 2)
+            excitation[..., masses] += self._by_body_loads(steps, by_mass)
         first, memory = load.new_zeros(B, N, N + columns), load.new_zeros(B, memories, N + columns)
         first[:, :, :N] = torch.eye(N, dtype=torch.float64)
         memory[:, :, N + self.reported :] = torch.eye(memories, dtype=torch.float64)
@@ -323,6 +316,24 @@ class LawWindows:
             loads = slice(self.first_load, self.reported)
             changed[..., loads] += (Q @ steps.force_rows @ springs.flatten(2)).view(B, len(Q), T, -1).transpose(1, 2)
         return found
+
+    def _by_element_loads(self, steps: LinearStep, load: Tensor, slope: Tensor, which: Tensor) -> Tensor:
+        """Changes of the states over each step (B, T - 1, N, P') by loads of the elements `which`, and their slopes."""
+        P0, S0, P1, S1 = (-(block @ self.model.simulator.H[which].T).unsqueeze(1) for block in steps.force_response)
+        excitation = P0 * load[:, :-1, None]
+        excitation += S0 * slope[:, :-1, None]
+        excitation += P1 * load[:, 1:, None]
+        excitation += S1 * slope[:, 1:, None]
+        return excitation
+
+    def _by_body_loads(self, steps: LinearStep, load: Tensor) -> Tensor:
+        """The same (B, T - 1, N, M) by loads of the coordinates (B, n, T, M)."""
+        B, _, T, _ = load.shape
+        slope = self.slope @ load
+        series = (load[:, :, :-1], slope[:, :, :-1], load[:, :, 1:], slope[:, :, 1:])
+        shown = (gain @ values.flatten(2) for gain, values in zip(steps.force_response, series, strict=True))
+        total: Tensor = sum(shown)  # type: ignore[assignment]
+        return total.view(B, -1, T - 1, load.shape[3]).transpose(1, 2)
 
     def by_drive(
         self,

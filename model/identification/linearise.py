@@ -91,20 +91,9 @@ class WindowModel:
 
         left = white_residual - white_free @ x0[:, None, :, None].to(white_free.dtype)
         x0 = x0[:, : discrete.Ad.shape[1]]
-        noise = self.noise_told(whiten, carried, left)
+        moved = self.moved_by(values, transfer.compliance, self.noise_told(whiten, carried, left))
         states = forced + s.free_states(discrete, x0, self.samples)
-        moved = self.moved_by(values, transfer.compliance, noise)
-        J, by_load = self._sensitivities(values, whiten @ transfer.per_force, states, data, moved)
-        masses, none = s.m_of[s.m_of.any(dim=1)], s.loading.pattern[:0]
-        if len(masses):
-            none = none.new_zeros(len(masses), *none.shape[1:])
-            J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, (masses, none), moved[0])], dim=3)
-        if x.shape[1] > len(s.m_of):
-            X = x.shape[1] - len(s.m_of)
-            terms = s.loading.exponents[:X], s.loading.pattern[:X]
-            of_load = self.by_inertia(values, transfer, whiten, states, data, terms, moved[0], s.loading.reach[:X])
-            J = torch.cat([J, of_load if by_load is None else of_load + by_load[..., :X]], dim=3)
-        J = as_rows(J)
+        J = as_rows(self._by_unknowns(x.shape[1], values, transfer, whiten, states, data, moved))
         across_products = basis @ J.mT
         across = torch.cholesky_solve(across_products, factor)
         information = J @ J.mT - across_products.mT @ across
@@ -115,6 +104,30 @@ class WindowModel:
         return Linearisation(
             whiten, transfer, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step
         )
+
+    def _by_unknowns(
+        self,
+        count: int,
+        values: ElementValues,
+        transfer: Transfer,
+        whiten: Tensor,
+        states: Tensor,
+        data: WindowBatch,
+        moved: tuple[Tensor, Tensor],
+    ) -> Tensor:
+        """Whitened sensitivities of the spectra to `count` unknowns: springs and dampers, masses, loads."""
+        s = self.simulator
+        J, by_load = self._sensitivities(values, whiten @ transfer.per_force, states, data, moved)
+        masses, none = s.m_of[s.m_of.any(dim=1)], s.loading.pattern[:0]
+        if len(masses):
+            none = none.new_zeros(len(masses), *none.shape[1:])
+            J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, (masses, none), moved[0])], dim=3)
+        loads = count - len(s.m_of)
+        if loads > 0:
+            terms = s.loading.exponents[:loads], s.loading.pattern[:loads]
+            of_load = self.by_inertia(values, transfer, whiten, states, data, terms, moved[0], s.loading.reach[:loads])
+            J = torch.cat([J, of_load if by_load is None else of_load + by_load[..., :loads]], dim=3)
+        return J
 
     def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> Chord:
         """One more step from (x, x0) with the products of `at`."""
