@@ -38,7 +38,7 @@ from sprung.model.system import System
 
 ALONE = {  # stages of recordings of their own, with what decides there
     "component": ("white_noise", "component", "verdict"),
-    "ambient": ("white_noise", "ambient", "verdict"),
+    "ambient": ("white_noise", "ambient", "ambient_window", "verdict"),
 }
 LAST = ("verdict", "report")  # stages that read finished investigations
 LATE = ("evidence", "selection", "plausible", "acceptance", "formula", "noise")  # stages that go on from begun ones
@@ -178,7 +178,7 @@ def _numbers(number: Field[Any]) -> list[Any]:
 
 def vary(subject: Subject, stage: str, number: Field[Any]) -> dict[str, Any] | None:
     """Set a number to both ends of its range on a recording; what changes.  None: its stage does not read it."""
-    if stage not in subject.reads if subject.reads else stage in ("component", "ambient"):
+    if stage not in subject.reads if subject.reads else stage in ("component", "ambient", "ambient_window"):
         return None
     changed, decades = [], 0.0
     for end in number.metadata["range"]:
@@ -277,8 +277,9 @@ def _difference(before: ReportedResult, after: ReportedResult) -> dict[str, Any]
 def _known(name: str, system: System, record: FalsifiedRecording) -> Subject:
     """A recording diagnosed under the usual rules, with the steps on the way."""
     options = Options(file=name, memory=FitMemory())
-    if is_component_test(system, record.values) or not system.file.inputs:
-        reads = ALONE["component" if system.file.inputs else "ambient"]
+    unmeasured = system.on_track or not system.file.inputs
+    if unmeasured or is_component_test(system, record.values):
+        reads = ALONE["ambient" if unmeasured else "component"]
         return Subject(name, system, record, options, ReportedResult.of(diagnose(system, record, options)), reads)
     state = begun(system, record, options, _silent)
     outcome = concluded(with_findings(state, _silent), _silent)

@@ -19,10 +19,12 @@ from scipy.signal import decimate
 
 from sprung.benchmarks.cars import EFFECTS, HUBS, recorded
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
+from sprung.benchmarks.generator.ride import draw_ride
+from sprung.benchmarks.generator.ride import record as ridden
 from sprung.benchmarks.setups import FalsifiedRecording, falsified, in_order
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.ride import simulate_ride
-from sprung.model.system import MANCHESTER, System, load_system, parse_system
+from sprung.model.system import BUNDLED, MANCHESTER, System, load_system, parse_system
 
 SETUPS = ("late sensors", "scale of a node", "sign of a sensor")
 RATE = 100.0  # Hz
@@ -70,6 +72,7 @@ sensors:
   a1: {kind: acceleration, body: one, noise: 0.001}
   a2: {kind: acceleration, body: two, noise: 0.001}
 """
+TRACK = (BUNDLED / "accelerometers.yaml").read_text(encoding="utf-8") + "\nspeed: {csv: v, noise: 0.1}\n"
 SHAKEN = """
 name: shaken
 sample_rate: 50
@@ -182,6 +185,7 @@ def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[t
     for number in range(rigs):
         yield f"rig-{number}", partial(_made, RIG, rig, seed + 2 + number, seconds)
     yield "tower", partial(_made, TOWER, tower, seed + 1)
+    yield "track", partial(_made, TRACK, track, seed + 5)
     for number, case in enumerate(PARTICULAR):
         yield case.name, partial(quarter_car, case, seconds, seed + 100 + number)
     for name, imperfect in IMPERFECT.items():
@@ -306,6 +310,14 @@ def shaken(random: np.random.Generator, samples: int = 4000) -> FalsifiedRecordi
     return FalsifiedRecording(
         "", frozenset(), shown + random.normal(0, 1, shown.shape) * [5, 3e-3, 3e-3, 3e-3], sample_rate=50.0
     )
+
+
+def track(random: np.random.Generator, seconds: float = 120.0) -> FalsifiedRecording:
+    """A healthy vehicle on a track that nobody measures, with its speed."""
+    ride = draw_ride(random, speed=(42.0, 42.0))
+    sensors = ridden(random, ride, seconds)
+    speed = ride.speed + 0.1 * random.standard_normal(len(sensors))
+    return FalsifiedRecording("", frozenset(), np.column_stack([speed, sensors]))
 
 
 def tower(random: np.random.Generator, seconds: float = 360.0) -> FalsifiedRecording:

@@ -24,6 +24,7 @@ ORDER = [
     "signals",
     "chunks",
     "work",
+    "rule",
     "text",
     "units",
     "parameters",

@@ -12,7 +12,6 @@ from sprung.model.ambient.sensing import sensing
 from sprung.model.ambient.speed import SPEED_STD, Track
 from sprung.model.ambient.track import Running, TrackExcitation
 from sprung.model.ambient.whittle import Whittle
-from sprung.model.ambient.window import EXCESS, GROUPS, HIGHEST
 from sprung.model.identifier import PRIOR_STD
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -28,13 +27,13 @@ def foreseen(system: System) -> FloatArray:
     An average track at the stated speed (or 42 m/s, unknown), or forces that lift the sensors far above their noise.
     """
     identifier = AmbientIdentifier(system)
-    window, rate = identifier.window, system.sample_rate
+    window, rate, rules = identifier.window, system.sample_rate, identifier.rules
     P = len(system.parameters)
     nothing = np.full(P, PRIOR_STD)
     low = window.low(system.window)
     if low is None:
         return nothing
-    frame = spectra(np.zeros((system.window, len(system.sensors))), rate, (low, HIGHEST * rate), window.sharpness)
+    frame = spectra(np.zeros((system.window, len(system.sensors))), rate, (low, rules.highest * rate), window.sharpness)
     every = sensing(system.mechanics, np.arange(len(system.sensors)), system.sensor_noise)
     responses = Responses(system, every, window.loads)
 
@@ -60,9 +59,9 @@ def foreseen(system: System) -> FloatArray:
         assumed, z = excitation(groups)
         x = np.concatenate([np.zeros(window.P), z])
         at = Whittle(responses, assumed, frame.part(groups)).evaluate(x)
-        audible = np.diagonal(at.covariance, axis1=1, axis2=2).real.max(axis=1) > 1 + EXCESS
+        audible = np.diagonal(at.covariance, axis1=1, axis2=2).real.max(axis=1) > 1 + rules.excess
         groups = groups[: len(audible) if audible.all() else int(np.argmin(audible))]
-        if len(groups) < GROUPS:
+        if len(groups) < rules.groups:
             return nothing
     precision = np.concatenate([window.prior_std, assumed.prior(z).std]) ** -2.0
     scale = np.sqrt(np.diag(at.information) + precision)

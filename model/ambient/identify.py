@@ -12,18 +12,15 @@ import numpy as np
 from sprung.model.ambient.excitation import Excitation
 from sprung.model.ambient.forces import ForceExcitation
 from sprung.model.ambient.periodogram import Spectra
+from sprung.model.ambient.rules import WINDOW_RULES, AmbientWindowRules
 from sprung.model.ambient.sensing import Sensing, sensing
 from sprung.model.ambient.speed import Track
-from sprung.model.ambient.transient import USUAL, TransientFit, TransientWindow
+from sprung.model.ambient.transient import TransientFit, TransientWindow
 from sprung.model.ambient.window import LOAD_STD, AmbientFit, WindowFit
 from sprung.model.identifier import PRIOR_STD, StageTimes, UnusableWindow
 from sprung.model.schema import Body
 from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System
-
-IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
-FIT_SIGMAS = 6.0  # chi-square further than this above one, or
-FIT_EXCESS = 0.3  # by this much: the window does not fit
 
 
 class Assumption(Protocol):
@@ -46,8 +43,8 @@ class Forces:
 class _WindowByWindow(ABC):
     """Identifies windows one after the other."""
 
-    def __init__(self, system: System) -> None:
-        self.system, self.times = system, StageTimes()
+    def __init__(self, system: System, rules: AmbientWindowRules) -> None:
+        self.system, self.rules, self.times = system, rules, StageTimes()
 
     @property
     def digest(self) -> str:
@@ -79,10 +76,10 @@ class _WindowByWindow(ABC):
 class AmbientIdentifier(_WindowByWindow):
     """Identifies windows of a system on a track (column 0 is the speed where it is measured) or without inputs."""
 
-    def __init__(self, system: System) -> None:
-        super().__init__(system)
+    def __init__(self, system: System, rules: AmbientWindowRules = WINDOW_RULES) -> None:
+        super().__init__(system, rules)
         varying = {name: body for name, body in system.file.bodies.items() if body.load is not None}
-        self.window = WindowFit(system, list(varying), [_load_std(body) for body in varying.values()])
+        self.window = WindowFit(system, list(varying), [_load_std(body) for body in varying.values()], rules)
         self.assumption: Assumption = Track(system, self.window) if system.on_track else Forces(system)
 
     def fit(self, values: FloatArray, start: FloatArray | None = None) -> AmbientFit | None:
@@ -105,7 +102,7 @@ class AmbientIdentifier(_WindowByWindow):
         fit = self.fit(values, start)
         present = np.asarray(np.isfinite(values[:, len(self.system.inputs) :]).all(axis=0))
         P = len(self.system.parameters)
-        return _silent(P, len(present)) if fit is None else as_estimate(fit, P, present)
+        return _silent(P, len(present)) if fit is None else as_estimate(fit, P, present, self.rules)
 
 
 class OutputOnlyIdentifier(_WindowByWindow):
@@ -114,9 +111,9 @@ class OutputOnlyIdentifier(_WindowByWindow):
     Where white forces do not explain a window, forces with a slope over frequency are tried.
     """
 
-    def __init__(self, system: System) -> None:
-        super().__init__(system)
-        self.window, self.coloured = TransientWindow(system), AmbientIdentifier(system)
+    def __init__(self, system: System, rules: AmbientWindowRules = WINDOW_RULES) -> None:
+        super().__init__(system, rules)
+        self.window, self.coloured = TransientWindow(system, rules), AmbientIdentifier(system, rules)
 
     def _estimate(self, values: FloatArray, start: FloatArray | None) -> Estimate:
         present = np.asarray(np.isfinite(values).all(axis=0))
@@ -127,10 +124,10 @@ class OutputOnlyIdentifier(_WindowByWindow):
         if not fit.adequate:
             coloured = self.coloured.fit(values, start)
             if coloured is not None:
-                seen = as_estimate(coloured, P, present)
+                seen = as_estimate(coloured, P, present, self.rules)
                 if seen.adequate and seen.identifiable.any():
                     return seen
-        return _of_transient(fit, P, present)
+        return _of_transient(fit, P, present, self.rules)
 
 
 def checked(system: System, windows: FloatArray) -> FloatArray:
@@ -144,10 +141,10 @@ def checked(system: System, windows: FloatArray) -> FloatArray:
     return windows
 
 
-def _of_transient(fit: TransientFit, P: int, present: BoolArray) -> Estimate:
+def _of_transient(fit: TransientFit, P: int, present: BoolArray, rules: AmbientWindowRules) -> Estimate:
     """The first P unknowns are the system's parameters."""
     covariance = fit.covariance[:P, :P]
-    identifiable = np.sqrt(np.diag(covariance)) < IDENTIFIABLE_STD
+    identifiable = np.sqrt(np.diag(covariance)) < rules.identifiable
     share = fit.noise_share
     per_sensor = np.full(len(present), np.nan)
     per_sensor[present] = share
@@ -157,7 +154,7 @@ def _of_transient(fit: TransientFit, P: int, present: BoolArray) -> Estimate:
         identifiable=identifiable,
         nrmse=float(np.sqrt(np.mean(share**2))),
         per_sensor=per_sensor,
-        chi_square=max(1.0, fit.misfit / USUAL) ** 2,
+        chi_square=fit.chi_square,
         adequate=fit.adequate,
         converged=fit.fitted.converged,
         iterations=fit.fitted.iterations,
@@ -166,13 +163,13 @@ def _of_transient(fit: TransientFit, P: int, present: BoolArray) -> Estimate:
     )
 
 
-def as_estimate(fit: AmbientFit, P: int, present: BoolArray) -> Estimate:
+def as_estimate(fit: AmbientFit, P: int, present: BoolArray, rules: AmbientWindowRules) -> Estimate:
     """The first P unknowns are the system's parameters."""
     fitted = fit.fitted
     # misfit counts as additional noise, which keeps the intervals valid
     covariance = fitted.covariance[:P, :P] * max(1.0, fit.chi_square)
-    identifiable = np.sqrt(np.diag(covariance)) < IDENTIFIABLE_STD
-    fits = fit.chi_square < 1 + max(FIT_SIGMAS * fit.chi_std, FIT_EXCESS)
+    identifiable = np.sqrt(np.diag(covariance)) < rules.identifiable
+    fits = fit.chi_square < 1 + max(rules.sigmas * fit.chi_std, rules.inaccuracy)
     per_sensor = np.full(len(present), np.nan)
     per_sensor[present] = fit.per_sensor
     return Estimate(

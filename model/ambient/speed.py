@@ -17,7 +17,7 @@ from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 SPEED_STD = 0.01  # of a speed that the file states or that an odometer measures, at the least, relative
-SLOWEST, FASTEST = 8.0, 100.0  # m/s; below, wheels are too far apart in time for windows of a minute
+FASTEST = 100.0  # m/s, that is tried where the speed is unknown
 SLOWNESS_STEP = 1.5e-3  # s/m between the speeds that are tried: a quarter of a period over 20 m at 8 Hz
 TRIED_BELOW = 8.0  # Hz, the part of the band in which speeds are compared
 TRIED_GROUPS = 60  # of that part, at the most
@@ -42,7 +42,7 @@ class Track:
         speed = float(measured.mean()) if measured.size else (None if stated is None else stated.value)
         if speed is None:
             return self._under(found, Running(self._search(found, sensed, None), np.inf))
-        if abs(speed) < SLOWEST:
+        if abs(speed) < self.window.rules.slowest:
             return None
         scatter = float(measured.std()) if measured.size else 0.0
         directed = self._search(found, sensed, speed)
@@ -66,7 +66,11 @@ class Track:
         own = excitation.prior(z)
         x = np.concatenate([np.zeros(P), z])
         prior = Prior(np.concatenate([np.zeros(P), own.mean]), np.concatenate([self.window.prior_std, own.std]))
-        magnitudes = np.arange(1 / FASTEST, 1 / SLOWEST, SLOWNESS_STEP) if speed is None else np.array([1 / abs(speed)])
+        magnitudes = (
+            np.arange(1 / FASTEST, 1 / self.window.rules.slowest, SLOWNESS_STEP)
+            if speed is None
+            else np.array([1 / abs(speed)])
+        )
         tried = [np.append(x[:-1], u) for u in (*-magnitudes[::-1], *magnitudes)]
         cost = np.array([likelihood.cost(at) for at in tried])
         lowest = np.flatnonzero((cost <= np.roll(cost, 1)) & (cost <= np.roll(cost, -1)))

@@ -23,6 +23,7 @@ from scipy.stats import norm
 from sprung.model.ambient.excitation import Prior
 from sprung.model.ambient.fit import PosteriorFit, fit
 from sprung.model.ambient.response import Response, Responses
+from sprung.model.ambient.rules import WINDOW_RULES, AmbientWindowRules
 from sprung.model.ambient.sensing import Sensing, sensing
 from sprung.model.ambient.whittle import Evaluation, adjoint
 from sprung.model.identifier import PRIOR_STD
@@ -30,19 +31,13 @@ from sprung.model.mechanics import Mode
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-LOWEST, HIGHEST = 0.5, 2.0  # of the lowest and highest natural frequency: the band that is compared, and
-NYQUIST = 0.4  # of the sample rate, where anti-aliasing filters begin
 LEAKS = (-1, 0, 1, 2, 3)  # powers of j w: from below the band, from above, and of what sampling folds back
 DECAYING = 15.0  # logarithm by which forces are weaker when a free decay is tried
 FIRST, LAST = 20, 100  # steps from every start, and from the best of them
-FEWEST = 12  # least number of bins
 LEVEL_STD = 3.0  # of the logarithm of a force's level about the one estimated from the signals' power
 NOISE_STD = 3.0  # of that of the noise power about the declared one
 STIFFER = np.linspace(-1.0, 1.0, 41)  # common log-ratios of all stiffnesses that are tried as starts
 BLURRED = 0.15  # damping ratio with which they are compared first
-PARTS = 8  # of the band, in which a fit is judged
-SURE = 1e-4  # chance of a good fit being judged as bad
-USUAL = 2.5  # standard deviations that the worst part of a good fit leaves its expectation by
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,16 +53,22 @@ class TransientFit:
     expected: FloatArray  # of the rest, by the model, shape (F, S)
     noise_share: FloatArray  # of every sensor's rms that the model takes for noise, shape (S,)
     misfit: float  # largest deviation of a part of the band from its expectation, in standard deviations
+    rules: AmbientWindowRules = WINDOW_RULES
 
     @property
     def adequate(self) -> bool:
         """Whether the structure explains the window."""
-        return bool(self.misfit < norm.isf(SURE / PARTS) and self.fitted.converged)
+        return bool(self.misfit < norm.isf(self.rules.misjudged / self.rules.parts) and self.fitted.converged)
 
     @property
     def covariance(self) -> FloatArray:
         """Covariance of x; misfit counts as additional noise."""
-        return self.fitted.covariance * max(1.0, self.misfit / USUAL) ** 2
+        return self.fitted.covariance * self.chi_square
+
+    @property
+    def chi_square(self) -> float:
+        """Of the worst part of the band over that of a good fit's; at least 1."""
+        return max(1.0, self.misfit / self.rules.usual) ** 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +149,8 @@ def _real(series: np.ndarray) -> FloatArray:
 class TransientWindow:
     """Fits windows of one system without inputs."""
 
-    def __init__(self, system: System) -> None:
-        self.system = system
+    def __init__(self, system: System, rules: AmbientWindowRules = WINDOW_RULES) -> None:
+        self.system, self.rules = system, rules
         self.modes = elastic(system)
 
     def bins(self, samples: int) -> FloatArray:
@@ -157,8 +158,8 @@ class TransientWindow:
         rate = self.system.sample_rate
         if not self.modes:
             return np.zeros(0)
-        low = max(LOWEST * self.modes[0].frequency, 2 * rate / samples)
-        high = min(HIGHEST * self.modes[-1].frequency, NYQUIST * rate)
+        low = max(self.rules.below * self.modes[0].frequency, 2 * rate / samples)
+        high = min(self.rules.above * self.modes[-1].frequency, self.rules.nyquist * rate)
         frequency = np.fft.rfftfreq(samples, 1 / rate)
         return np.asarray(frequency[(frequency >= low) & (frequency <= high)])
 
@@ -170,7 +171,7 @@ class TransientWindow:
         start: initial log-ratios (P,).  known: fixed log-ratios (P,); only levels are estimated.
         """
         frequency = self.bins(len(values))
-        if len(frequency) < max(FEWEST, len(self.system.parameters) + 2):
+        if len(frequency) < max(self.rules.bins, len(self.system.parameters) + 2):
             return None
         sensed = sensing(self.system.mechanics, sensors, self.system.sensor_noise[sensors])
         spectrum = np.fft.rfft(values - values.mean(axis=0), axis=0, norm="ortho")
@@ -179,7 +180,8 @@ class TransientWindow:
         if np.mean(np.abs(signals) ** 2, axis=0).max() < 2:
             return None
         fitted = self._fit(sensed, signals, 2 * np.pi * frequency, start, known)
-        return _judged(fitted, frequency, np.abs(spectrum[first : first + len(frequency)]) ** 2, sensed)
+        whole = np.abs(spectrum[first : first + len(frequency)]) ** 2
+        return _judged(fitted, frequency, whole, sensed, self.rules)
 
     def _fit(
         self,
@@ -234,11 +236,13 @@ class TransientWindow:
         return found
 
 
-def _judged(fitted: PosteriorFit, frequency: FloatArray, whole: FloatArray, sensed: Sensing) -> TransientFit:
+def _judged(
+    fitted: PosteriorFit, frequency: FloatArray, whole: FloatArray, sensed: Sensing, rules: AmbientWindowRules
+) -> TransientFit:
     """How well the power in parts of the band is the expected one."""
     at = fitted.at
     white = np.einsum("frr->fr", at.whitened).real
-    parts = np.array_split(np.arange(len(frequency)), min(PARTS, max(1, len(frequency) // 4)))
+    parts = np.array_split(np.arange(len(frequency)), min(rules.parts, max(1, len(frequency) // 4)))
     deviation = [np.abs(white[part].mean(axis=0) - 1) * np.sqrt(len(part)) for part in parts]
     factor, back = np.linalg.cholesky(at.covariance), np.linalg.pinv(sensed.rows)
     rest = back @ factor @ at.whitened @ adjoint(back @ factor)
@@ -251,6 +255,7 @@ def _judged(fitted: PosteriorFit, frequency: FloatArray, whole: FloatArray, sens
         expected=np.einsum("fss->fs", back @ at.covariance @ back.T).real,
         noise_share=np.minimum(noise, 1.0),
         misfit=float(np.max(deviation)),
+        rules=rules,
     )
 
 

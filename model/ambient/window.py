@@ -11,18 +11,13 @@ from sprung.model.ambient.excitation import Excitation, Prior
 from sprung.model.ambient.fit import PosteriorFit, fit
 from sprung.model.ambient.periodogram import Spectra, spectra
 from sprung.model.ambient.response import Responses
+from sprung.model.ambient.rules import WINDOW_RULES, AmbientWindowRules
 from sprung.model.ambient.sensing import Sensing
 from sprung.model.ambient.whittle import Whittle
 from sprung.model.identifier import PRIOR_STD
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-LOWEST = 0.75  # of the lowest natural frequency, where the band begins
-HIGHEST = 0.36  # of the sample rate: anti-aliasing filters begin above
-LONGEST = 4.0  # periods of the band's lower edge that a window holds, at least
-EXCESS = 4.0  # power over noise, below which a sensor is uninformative
-OCTAVES = 1.0  # of band, and
-GROUPS = 12  # of bins, below which a window is uninformative
 SHARPEST, BLUNTEST = 0.002, 0.03  # width of a group of bins over its frequency
 BLURS = (0.1, 0.01, 0.001)  # see `Whittle`; steps on the way to none
 RIGID = 1e-6  # of the highest natural frequency: slower modes are motions of the whole without any spring
@@ -60,9 +55,15 @@ class AmbientFit:
 class WindowFit:
     """Fits windows of one system under one kind of excitation."""
 
-    def __init__(self, system: System, loads: Sequence[str] = (), load_std: Sequence[float] = ()) -> None:
+    def __init__(
+        self,
+        system: System,
+        loads: Sequence[str] = (),
+        load_std: Sequence[float] = (),
+        rules: AmbientWindowRules = WINDOW_RULES,
+    ) -> None:
         """loads: bodies whose mass and inertias are unknown, too, with the standard deviations of their logarithms."""
-        self.system, self.loads = system, tuple(loads)
+        self.system, self.loads, self.rules = system, tuple(loads), rules
         P = len(system.parameters)
         self.prior_std = np.concatenate([np.full(P, PRIOR_STD), np.asarray(load_std, dtype=np.float64)])
         modes = system.mechanics.modes(system.bodies)
@@ -79,25 +80,25 @@ class WindowFit:
     def low(self, samples: int) -> float | None:
         """Lower edge of the band of a window of `samples`, Hz; None where it is too short."""
         rate = self.system.sample_rate
-        low = max(LOWEST * self.lowest, LONGEST * rate / samples)
-        return None if low * 2**OCTAVES > HIGHEST * rate else low
+        low = max(self.rules.lowest * self.lowest, self.rules.periods * rate / samples)
+        return None if low * 2**self.rules.octaves > self.rules.highest * rate else low
 
     def spectra(self, values: FloatArray, noise: FloatArray) -> Spectra | None:
         """Spectra (T, S) in the band in which a sensor stands out of its noise (S,); None where there is too little."""
-        rate = self.system.sample_rate
+        rules, rate = self.rules, self.system.sample_rate
         low = self.low(len(values))
         if low is None:
             return None
-        found = spectra(values, rate, (low, HIGHEST * rate), self.sharpness)
+        found = spectra(values, rate, (low, rules.highest * rate), self.sharpness)
         power = np.diagonal(found.matrix, axis1=1, axis2=2).real / noise**2
         about = np.maximum(found.weight, 1e-9)
         width = np.ones(max(1, min(9, len(about) // 4)))
         smooth = np.stack([np.convolve(p * about, width, "same") for p in power.T], axis=1)
         smooth /= np.convolve(about, width, "same")[:, None]
-        silent = np.flatnonzero(smooth.max(axis=1) < EXCESS)
+        silent = np.flatnonzero(smooth.max(axis=1) < rules.excess)
         top = found.frequency[silent[0]] * 0.97 if len(silent) else np.inf
         keep = found.frequency < top
-        if keep.sum() < GROUPS or found.frequency[keep][-1] < low * 2**OCTAVES:
+        if keep.sum() < rules.groups or found.frequency[keep][-1] < low * 2**rules.octaves:
             return None
         return found.part(np.flatnonzero(keep))
 

@@ -11,17 +11,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import Field, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from sprung.model.ambient.rules import WINDOW_RULES, AmbientWindowRules
+from sprung.model.rule import rule
+
 VARIED = Path(__file__).with_name("varied.json")  # made by `sprung bench sensitivity --write`
-
-
-def rule(value: Any, reason: str, low: Any, high: Any) -> Any:
-    """A deciding number with its reason, and the range over which `sprung bench sensitivity` varies it."""
-    return field(default=value, metadata={"reason": reason, "range": (low, high)})
 
 
 def reason(stage: str, number: Field[Any]) -> str:
@@ -488,6 +486,7 @@ class Rules:
     report: ReportRules = ReportRules()
     component: ComponentRules = ComponentRules()
     ambient: AmbientRules = AmbientRules()
+    ambient_window: AmbientWindowRules = WINDOW_RULES
 
     def constants(self) -> Iterator[tuple[str, Field[Any]]]:
         """Every number as the stage's name and its field."""

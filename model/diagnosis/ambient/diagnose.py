@@ -35,7 +35,9 @@ def diagnose_unforced(
     """
     signals = prepared.signals
     rules, memory = options.rules.ambient, options.memory or FitMemory()
-    windows, note = all_windows(system, signals, rules, memory, lambda share: progress(0.05 + 0.5 * share, "windows"))
+    windows, note = all_windows(
+        system, signals, options.rules, memory, lambda share: progress(0.05 + 0.5 * share, "windows")
+    )
     if not windows:
         seconds = min(system.window, signals.samples) / system.sample_rate
         raise TooLittleError(
@@ -52,7 +54,7 @@ def diagnose_unforced(
         held = windows[-1:]
         notes.append("the recording is too short for a held-out part: the fit was judged on the same window")
     progress(0.8, "validation on the last part")
-    shared = with_known(system, signals, held, pooled.log_ratio, memory) or held
+    shared = with_known(system, signals, held, pooled.log_ratio, options.rules.ambient_window, memory) or held
     varying = bool(np.any(pooled.varying))
     errors, band = errors_of(shared, held if varying else shared, rules)
     progress(0.95, "report")

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.ambient.identify import AmbientIdentifier, as_estimate
+from sprung.model.ambient.rules import AmbientWindowRules
 from sprung.model.ambient.sensing import sensing
 from sprung.model.ambient.transient import TransientWindow
 from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.record.signals import Signals
-from sprung.model.diagnosis.rules import AmbientRules
+from sprung.model.diagnosis.rules import AmbientRules, Rules
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
@@ -49,8 +50,9 @@ class WindowResult:
 class ShakenStructure:
     """Windows of a structure under unmeasured forces."""
 
-    def __init__(self, system: System, signals: Signals) -> None:
-        self.system, self.signals, self.window = system, signals, TransientWindow(system)
+    def __init__(self, system: System, signals: Signals, rules: AmbientWindowRules) -> None:
+        self.system, self.signals, self.window = system, signals, TransientWindow(system, rules)
+        self.rules = rules
 
     def result(self, start: int, stop: int, known: FloatArray | None) -> WindowResult | None:
         """Result of a window of samples; with `known` log-ratios (P,) only force levels are fitted."""
@@ -66,8 +68,9 @@ class ShakenStructure:
 class UnmeasuredTrack:
     """Windows of a vehicle on an unmeasured track."""
 
-    def __init__(self, system: System, signals: Signals) -> None:
-        self.system, self.signals, self.identifier = system, signals, AmbientIdentifier(system)
+    def __init__(self, system: System, signals: Signals, rules: AmbientWindowRules) -> None:
+        self.system, self.signals, self.identifier = system, signals, AmbientIdentifier(system, rules)
+        self.rules = rules
 
     def result(self, start: int, stop: int, known: FloatArray | None) -> WindowResult | None:
         """Result of a window of samples; `known` is ignored: its parameters are always fitted."""
@@ -79,7 +82,7 @@ class UnmeasuredTrack:
         if fit is None:
             return None
         present = np.isin(np.arange(len(system.sensors)), sensors)
-        estimate = as_estimate(fit, len(system.parameters), present)
+        estimate = as_estimate(fit, len(system.parameters), present, self.rules)
         sensed = sensing(system.mechanics, sensors, system.sensor_noise[sensors])
         back = np.linalg.pinv(sensed.rows)
         seen = np.einsum("sr,frt,st->fs", back, sensed.seen(fit.spectra.matrix), back).real
@@ -120,17 +123,18 @@ class _Remembering:
 
     def result(self, start: int, stop: int, known: FloatArray | None) -> WindowResult | None:
         sensors = np.ascontiguousarray(self.looked.signals.sensors[start:stop])
-        key = (type(self.looked), start, sensors.tobytes(), None if known is None else known.tobytes())
+        fixed = None if known is None else known.tobytes()
+        key = (type(self.looked), self.looked.rules, start, sensors.tobytes(), fixed)
         return self.memory.recall(key, lambda: self.looked.result(start, stop, known))
 
 
 def all_windows(
-    system: System, signals: Signals, rules: AmbientRules, memory: FitMemory, progress: Progress
+    system: System, signals: Signals, rules: Rules, memory: FitMemory, progress: Progress
 ) -> tuple[list[WindowResult], str]:
     """All informative windows, and omitted parts in words."""
     kind = UnmeasuredTrack if system.on_track else ShakenStructure
-    looked = _Remembering(kind(system, signals), memory)
-    cuts, note = stretches(system, signals, rules)
+    looked = _Remembering(kind(system, signals, rules.ambient_window), memory)
+    cuts, note = stretches(system, signals, rules.ambient)
     found = []
     for number, (start, stop) in enumerate(cuts):
         progress(number / len(cuts))
@@ -141,12 +145,17 @@ def all_windows(
 
 
 def with_known(
-    system: System, signals: Signals, windows: list[WindowResult], known: FloatArray, memory: FitMemory
+    system: System,
+    signals: Signals,
+    windows: list[WindowResult],
+    known: FloatArray,
+    rules: AmbientWindowRules,
+    memory: FitMemory,
 ) -> list[WindowResult]:
     """The same windows with common parameters (P,)."""
     if system.on_track:
         return windows
-    looked, again = _Remembering(ShakenStructure(system, signals), memory), []
+    looked, again = _Remembering(ShakenStructure(system, signals, rules), memory), []
     for window in windows:
         start, stop = (round((at - signals.start) * signals.sample_rate) for at in (window.begin, window.end))
         result = looked.result(start, stop, known)

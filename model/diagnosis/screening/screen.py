@@ -20,7 +20,8 @@ def screen(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = Tr
     """Scores of all candidates on the residual of a fit, by p-value."""
     if problem.memory is None:
         return _screened(problem, fit, laws, project)
-    key = "screen", id(fit), problem.rules.screening, tuple(law.name for law in laws), project
+    rules = problem.rules.screening, problem.rules.plausible, problem.rules.setup  # those that are read
+    key = "screen", id(fit), rules, tuple(law.name for law in laws), project
     # the cache holds the fit, so that its id stays unique
     return problem.memory.recall(key, lambda: (fit, _screened(problem, fit, laws, project)))[1]
 
