@@ -339,3 +339,9 @@ def no_shapes(seen: MotionSizes) -> FloatArray:
 
 def rates_at(seen: MotionSizes, shares: Sequence[float]) -> FloatArray:
     return np.interp(shares, np.linspace(0, 1, 101), seen.rate)
+
+
+def wider_form(law: ElementLaw) -> ElementLaw:
+    """The wider form of a law that has one."""
+    assert law.wider is not None
+    return law.wider

@@ -1,0 +1,97 @@
+"""Dampers of the catalogue, and springs behind them, as pieces of a component's force: see `pieces`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.component.piece import (
+    FittedPiece,
+    MotionSizes,
+    Piece,
+    no_shapes,
+    rates_at,
+    wider_form,
+)
+from sprung.model.laws import SpringDamper, grid
+from sprung.model.laws.damping import DAMPER_ASYMMETRY, DAMPER_BLOWOFF, QUADRATIC_DAMPING
+from sprung.model.laws.hysteresis import AIR_SPRING, SERIES_STIFFNESS
+
+
+def _knee_limits(seen: MotionSizes) -> tuple[float, float]:
+    return (seen.lowest_knee, float(seen.rate[97]))
+
+
+def _damping(element: SpringDamper) -> float:
+    return max(float(element.damping), 1e-300)
+
+
+def _apart_from_zero(value: float) -> float:
+    return value if value != 0 else 1e-300
+
+
+def _opens_late_enough(fitted: FittedPiece) -> bool:
+    """A plausible valve: lower slope beyond the knee, and knees that the sampling resolves."""
+    ratios = [fitted.values[name] for name in ("ratio", "ratio_compression") if name in fitted.values]
+    knees = [fitted.values[name] for name in ("knee", "knee_compression") if name in fitted.values]
+    least, most = fitted.rules.valve_least, fitted.rules.valve_most
+    return all(least <= r < most for r in ratios) and all(k > fitted.corner for k in knees)
+
+
+_QUADRATIC = Piece(QUADRATIC_DAMPING, (), no_shapes, lambda seen: [], (1,), lambda a, s, e: (a[0],), lambda p: ())
+_BLOWOFF = Piece(
+    DAMPER_BLOWOFF,
+    ("knee",),
+    lambda seen: grid(rates_at(seen, [0.2, 0.35, 0.5, 0.65, 0.8, 0.9])),
+    lambda seen: [_knee_limits(seen)],
+    (-1,),
+    lambda a, s, e: (s[0], 1 + a[0] / _damping(e)),
+    lambda p: (p[0],),
+    lambda a, s, e: {"force_at_knee": (float(e.damping) * s[0], "N")},
+    believed=_opens_late_enough,
+)
+_TWO_KNEES = Piece(
+    wider_form(DAMPER_BLOWOFF),
+    ("knee", "knee_compression"),
+    lambda seen: grid(rates_at(seen, [0.2, 0.4, 0.7]), rates_at(seen, [0.2, 0.4, 0.7])),
+    lambda seen: [_knee_limits(seen)] * 2,
+    (-1, -1),
+    lambda a, s, e: (s[0], 1 + a[0] / _damping(e), s[1], 1 + a[1] / _damping(e)),
+    lambda p: (p[0], p[2]),
+    plain=1,
+    believed=_opens_late_enough,
+)
+_ASYMMETRY = Piece(
+    DAMPER_ASYMMETRY,
+    (),
+    no_shapes,
+    lambda seen: [],
+    (0,),
+    lambda a, s, e: (a[0] / _damping(e),),
+    lambda p: (),
+    believed=lambda fitted: abs(fitted.values["a"]) <= 1.0,
+)
+_ASYMMETRY_OF_VALVES = Piece(
+    wider_form(DAMPER_ASYMMETRY),
+    ("knee",),
+    lambda seen: grid(rates_at(seen, [0.2, 0.4, 0.7])),
+    lambda seen: [_knee_limits(seen)],
+    (0, 0),  # of the rate's magnitude, and of the part below the knee
+    lambda a, s, e: ((a[0] + a[1]) / _damping(e), s[0], a[0] / _apart_from_zero(a[0] + a[1])),
+    lambda p: (p[1],),
+    plain=1,
+    believed=lambda fitted: _opens_late_enough(fitted) and abs(fitted.values["a"]) <= 1.0,
+)
+_SERIES = Piece(
+    SERIES_STIFFNESS,
+    ("tau",),
+    lambda seen: grid(np.geomspace(2 * seen.step, 0.1 * seen.seconds, 9)),
+    lambda seen: [(0.5 * seen.step, seen.seconds)],
+    (1,),
+    lambda a, s, e: (a[0],),
+    lambda p: (0.1,),
+    lambda a, s, e: {"relaxation_time": (s[0], "s")},
+    acting=AIR_SPRING,  # the branch of spring and damper in series, with a damper beside it that is free
+    acting_parameters=lambda a, s, e: (a[0], s[0]),
+)
+
+DAMPING_PIECES: tuple[Piece, ...] = (_QUADRATIC, _BLOWOFF, _TWO_KNEES, _ASYMMETRY, _ASYMMETRY_OF_VALVES, _SERIES)

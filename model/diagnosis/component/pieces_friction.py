@@ -1,0 +1,187 @@
+"""Friction and hysteresis of the catalogue as pieces of a component's force: see `pieces`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sprung.model.diagnosis.component.piece import (
+    FRICTION,
+    HYSTERESIS,
+    FittedPiece,
+    MotionSizes,
+    Piece,
+    Shape,
+    Values,
+    wider_form,
+)
+from sprung.model.laws import SpringDamper, grid
+from sprung.model.laws.damping import COULOMB_FRICTION, DAMPER_BLOWOFF
+from sprung.model.laws.friction import DAHL, LUGRE, STRIBECK
+from sprung.model.laws.hysteresis import BOUC_WEN
+from sprung.model.laws.lost_motion import FRICTION_BACKLASH, PINCHED_HYSTERESIS
+from sprung.model.laws.paths import stop_path
+from sprung.model.laws.reversals import GAMMA
+from sprung.model.signals import FloatArray
+
+_SHARPEST = 1e-6  # distance of an exponent from 1 below which it is 1
+
+
+def _yields(seen: MotionSizes) -> FloatArray:
+    return seen.travel * np.geomspace(0.004, 0.8, 9)
+
+
+def _yield_limits(seen: MotionSizes) -> tuple[float, float]:
+    return (2e-4 * seen.travel, 0.8 * seen.travel)  # a larger yield displacement is a softening spring
+
+
+def _falls(fitted: FittedPiece) -> bool:
+    """Whether the fall of a friction with the rate was observed to a sufficient part."""
+    force, static = fitted.values["force"], fitted.values["static_force"]
+    fall, smoothing = fitted.values["stribeck_rate"], fitted.values["smoothing"]
+    rate = fall * np.linspace(0.0, 3.0, 301)
+    shown = np.tanh(rate / smoothing) * (force + (static - force) * np.exp(-((rate / fall) ** 2)))
+    return bool(shown.max() - force > fitted.rules.seen_to_fall * (static - force))
+
+
+def _slips(fitted: FittedPiece) -> bool:
+    """Whether it slips at all; otherwise it is a spring with a gap."""
+    gap, reach = fitted.shape
+    u = np.abs(stop_path(fitted.deflection, 0.5 * gap + reach))
+    return bool(np.mean(u > 0.999 * (0.5 * gap + reach)) > fitted.rules.slips)
+
+
+def _yield_words(a: FloatArray, s: Shape, e: SpringDamper) -> Values:
+    return {"yield_force": (a[0], "N"), "yield_displacement": (s[0], "m")}
+
+
+_COULOMB = Piece(
+    COULOMB_FRICTION,
+    ("smoothing",),
+    lambda seen: grid(seen.rate_rms * np.geomspace(0.005, 0.5, 7)),
+    lambda seen: [(1e-3 * seen.rate_rms, 0.8 * seen.rate_rms)],
+    (1,),
+    lambda a, s, e: (a[0], s[0]),
+    lambda p: (p[1],),
+    lambda a, s, e: {"breakaway_force": (a[0], "N")},
+    kind=FRICTION,
+    at_low_rates=DAMPER_BLOWOFF,
+)
+_STRIBECK = Piece(
+    STRIBECK,
+    ("smoothing", "stribeck_rate"),
+    lambda seen: grid(seen.rate_rms * np.geomspace(0.005, 0.2, 4), seen.rate_rms * np.geomspace(0.05, 0.8, 4)),
+    lambda seen: [(1e-3 * seen.rate_rms, 0.5 * seen.rate_rms), (0.01 * seen.rate_rms, 1.5 * seen.rate_rms)],
+    (1, 1),
+    lambda a, s, e: (a[0], a[0] + a[1], s[1], s[0]),
+    lambda p: (p[3], p[2]),
+    lambda a, s, e: {"breakaway_force": (a[0] + a[1], "N")},
+    kind=FRICTION,
+    plain=1,
+    believed=_falls,
+)
+_DAHL = Piece(
+    DAHL,
+    ("yield_displacement",),
+    lambda seen: grid(_yields(seen)),
+    lambda seen: [_yield_limits(seen)],
+    (1,),
+    lambda a, s, e: (a[0], a[0] / s[0]),
+    lambda p: (p[0] / p[1],),
+    _yield_words,
+    kind=HYSTERESIS,
+    plain=1,
+)
+_LUGRE = Piece(
+    LUGRE,
+    ("yield_displacement", "stribeck_rate", "excess"),
+    lambda seen: grid(
+        seen.travel * np.geomspace(0.004, 0.3, 4), seen.rate_rms * np.geomspace(0.05, 0.8, 3), [0.3, 1.5]
+    ),
+    lambda seen: [_yield_limits(seen), (0.01 * seen.rate_rms, 1.5 * seen.rate_rms), (1e-3, 3.0)],
+    (1,),
+    lambda a, s, e: (a[0], a[0] * (1 + s[2]), s[1], a[0] / s[0]),
+    lambda p: (p[0] / p[3], p[2], p[1] / p[0] - 1),
+    _yield_words,
+    kind=HYSTERESIS,
+    plain=1,
+)
+
+
+def _loop(a: FloatArray, s: Shape, e: SpringDamper) -> tuple[float, ...]:
+    """Parameters of the Bouc-Wen law from yield force (strength), yield displacement, exponent and gamma (shapes)."""
+    n = 1.0 if s[1] < 1 + _SHARPEST else s[1]
+    gamma = s[2] if len(s) > 2 else GAMMA
+    return (a[0] / s[0], 1 / ((1 + gamma) * s[0] ** n), n, *s[2:])
+
+
+def _loop_shape(p: Sequence[float]) -> tuple[float, ...]:
+    gamma = p[3] if len(p) > 3 else GAMMA
+    return (((1 + gamma) * p[1]) ** (-1 / p[2]), p[2], *p[3:])
+
+
+_BOUC_WEN = Piece(
+    BOUC_WEN,
+    ("yield_displacement", "n"),
+    lambda seen: grid(_yields(seen), [1.0, 2.0]),
+    lambda seen: [_yield_limits(seen), (1.0, 8.0)],
+    (1,),
+    _loop,
+    _loop_shape,
+    _yield_words,
+    kind=HYSTERESIS,
+)
+_FREE_BOUC_WEN = Piece(
+    wider_form(BOUC_WEN),
+    ("yield_displacement", "n", "gamma"),
+    lambda seen: grid(_yields(seen)[::2], [1.0], [-0.6, 0.0, 1.5]),
+    lambda seen: [_yield_limits(seen), (1.0, 8.0), (-0.95, 4.0)],
+    (1,),
+    _loop,
+    _loop_shape,
+    _yield_words,
+    kind=HYSTERESIS,
+)
+_PINCHED = Piece(
+    PINCHED_HYSTERESIS,
+    ("yield_displacement", "pinching_width"),
+    lambda seen: grid(seen.travel * np.geomspace(0.01, 0.4, 5), seen.travel * np.array([0.1, 0.25, 0.5])),
+    lambda seen: [_yield_limits(seen), (0.03 * seen.travel, 1.0 * seen.travel)],
+    (1, -1),
+    lambda a, s, e: (a[0], s[0], -a[1] / max(a[0], 1e-300), s[1]),
+    lambda p: (p[1], p[3]),
+    lambda a, s, e: {"yield_force": (a[0], "N")},
+    kind=HYSTERESIS,
+    plain=2,
+)
+
+
+def _inner(a: FloatArray, s: Shape) -> float:
+    """Stiffness within the gap, N/m."""
+    return float(a[1] / (0.5 * s[0] + s[1]))
+
+
+_BACKLASH = Piece(
+    wider_form(FRICTION_BACKLASH),
+    ("gap", "reach"),
+    lambda seen: grid(seen.travel * np.geomspace(0.02, 0.9, 7), seen.travel * np.geomspace(0.01, 0.5, 6)),
+    lambda seen: [(2e-3 * seen.travel, 1.8 * seen.travel), (1e-3 * seen.travel, 1.5 * seen.travel)],
+    (1, 1),
+    lambda a, s, e: (a[0] + a[1], s[0], a[0] / s[1] + _inner(a, s), _inner(a, s)),
+    lambda p: (p[1], (p[0] - 0.5 * p[1] * (p[3] if len(p) > 3 else 0.0)) / p[2]),
+    lambda a, s, e: {"slip_force": (a[0] + a[1], "N"), "lost_motion": (s[0], "m")},
+    kind=HYSTERESIS,
+    believed=_slips,
+)
+
+FRICTION_PIECES: tuple[Piece, ...] = (
+    _COULOMB,
+    _STRIBECK,
+    _DAHL,
+    _LUGRE,
+    _BOUC_WEN,
+    _FREE_BOUC_WEN,
+    _PINCHED,
+    _BACKLASH,
+)

@@ -1,0 +1,150 @@
+"""Springs, stops and gaps of the catalogue as pieces of a component's force: see `pieces`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.component.piece import (
+    ELASTIC,
+    FittedPiece,
+    Piece,
+    no_shapes,
+    wider_form,
+)
+from sprung.model.laws import grid
+from sprung.model.laws.gas import GAS_SPRING
+from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS, PROGRESSIVE_STOP
+from sprung.model.laws.viscoelastic import FRACTIONAL_STIFFNESS
+
+_POLYTROPIC = 1.3  # of a gas; not identifiable beside the column's length at usual rates
+
+
+def _loose_within(fitted: FittedPiece) -> bool:
+    """Whether the spring keeps no force within the gap."""
+    return bool(abs(fitted.strengths[0] / max(fitted.element.stiffness, 1e-300) - 1) < fitted.rules.lost)
+
+
+def _held_within(fitted: FittedPiece) -> bool:
+    """Whether there is a force before the stop; otherwise it is a spring with clearance."""
+    return bool(fitted.element.stiffness > fitted.rules.lost * np.max(fitted.strengths))
+
+
+def _softest_within(fitted: FittedPiece) -> bool:
+    """Whether the softest point, -k2 / (3 k3), lies within the travel."""
+    travel = 0.5 * float(np.ptp(fitted.deflection))
+    return bool(abs(fitted.values["k2"]) < 3 * abs(fitted.values["k3"]) * travel)
+
+
+def _stops(fitted: FittedPiece) -> bool:
+    """Whether a two-sided stop is stiff where it is compressed most; a soft one corrects the spring."""
+    middle = 0.5 * (fitted.deflection.max() + fitted.deflection.min())
+    d = fitted.deflection - middle
+    depths = np.maximum([d.max() - fitted.shape[0], -d.min() - fitted.shape[1]], 0.0)
+    power = fitted.values.get("exponent", 1.0) - 1
+    hardest = np.max(fitted.strengths * (depths / np.array(fitted.shape[:2])) ** power)
+    return _held_within(fitted) and bool(hardest > fitted.rules.stops * fitted.element.stiffness)
+
+
+_CUBIC = Piece(
+    CUBIC_STIFFNESS,
+    (),
+    no_shapes,
+    lambda seen: [],
+    (0,),
+    lambda a, s, e: (a[0],),
+    lambda p: (),
+    kind=ELASTIC,
+)
+_CUBIC_OFF_CENTRE = Piece(
+    wider_form(CUBIC_STIFFNESS),
+    (),
+    no_shapes,
+    lambda seen: [],
+    (0, 0),
+    lambda a, s, e: (a[0], a[1]),
+    lambda p: (),
+    kind=ELASTIC,
+    plain=1,
+    believed=_softest_within,
+    imitates=True,
+)
+_BUMP_STOP = Piece(
+    BUMP_STOP,
+    ("gap",),
+    lambda seen: grid(seen.travel * np.array([0.3, 0.5, 0.65, 0.8, 0.9])),
+    lambda seen: [(0.1 * seen.travel, 0.97 * seen.travel)],
+    (1,),
+    lambda a, s, e: (s[0], a[0]),
+    lambda p: (p[0],),
+    kind=ELASTIC,
+    believed=_held_within,
+)
+_TWO_STOPS = Piece(
+    wider_form(BUMP_STOP),
+    ("gap", "gap_compression"),
+    lambda seen: grid(*[seen.travel * np.array([0.3, 0.5, 0.7, 0.85])] * 2),
+    lambda seen: [(0.25 * seen.travel, 0.97 * seen.travel)] * 2,
+    (1, 1),
+    lambda a, s, e: (s[0], a[0], s[1], a[1]),
+    lambda p: (p[0], p[2]),
+    kind=ELASTIC,
+    plain=1,
+    believed=_stops,
+    imitates=True,
+)
+_PROGRESSIVE_STOP = Piece(
+    PROGRESSIVE_STOP,
+    ("gap", "gap_compression", "exponent"),
+    lambda seen: grid(*[seen.travel * np.array([0.3, 0.5, 0.75])] * 2, [1.5, 2.5]),
+    lambda seen: [(0.25 * seen.travel, 0.97 * seen.travel)] * 2 + [(1.0, 3.5)],  # nearer, it is a progressive spring
+    (1, 1),
+    lambda a, s, e: (s[0], a[0], s[1], a[1], s[2]),
+    lambda p: (p[0], p[2], p[4]),
+    kind=ELASTIC,
+    plain=2,
+    believed=_stops,
+    imitates=True,
+)
+_CLEARANCE = Piece(
+    CLEARANCE,
+    ("gap",),
+    lambda seen: grid(seen.travel * np.array([0.05, 0.1, 0.2, 0.35, 0.55, 0.75])),
+    lambda seen: [(0.01 * seen.travel, 0.9 * seen.travel)],
+    (1,),
+    lambda a, s, e: (s[0],),
+    lambda p: (p[0],),
+    kind=ELASTIC,
+    believed=_loose_within,
+)
+_GAS_SPRING = Piece(
+    GAS_SPRING,
+    ("length",),
+    lambda seen: grid(seen.travel * np.array([1.3, 2.0, 4.0, 10.0])),
+    lambda seen: [(1.1 * seen.travel, 30.0 * seen.travel)],
+    (1,),
+    lambda a, s, e: (a[0], s[0], _POLYTROPIC),
+    lambda p: (p[1],),
+    kind=ELASTIC,
+    plain=1,
+)
+_FRACTIONAL = Piece(
+    FRACTIONAL_STIFFNESS,
+    ("order",),
+    lambda seen: grid([0.1, 0.2, 0.35, 0.55]),
+    lambda seen: [(0.03, 0.9)],
+    (1,),
+    lambda a, s, e: (a[0], s[0]),
+    lambda p: (p[1],),
+    plain=1,
+)
+
+STIFFNESS_PIECES: tuple[Piece, ...] = (
+    _CUBIC,
+    _CUBIC_OFF_CENTRE,
+    _BUMP_STOP,
+    _TWO_STOPS,
+    _PROGRESSIVE_STOP,
+    _CLEARANCE,
+    _GAS_SPRING,
+    _FRACTIONAL,
+)
