@@ -21,7 +21,7 @@ from scipy.stats import chi2
 
 from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.running import run_day
-from sprung.benchmarks.generator.timetable import MONTH, REFERENCE, Service, channel_names, draw_timetable
+from sprung.benchmarks.generator.timetable import MONTH, REFERENCE, Service, draw_timetable
 from sprung.benchmarks.generator.vehicle import read_vehicle
 from sprung.benchmarks.hours import HOUR, full_hours
 from sprung.benchmarks.keeping import keep, kept
@@ -58,7 +58,7 @@ def library(system: System, count: int, seed: int) -> list[Estimate]:
     vehicle = read_vehicle(SYSTEM)
     timetable = draw_timetable(vehicle, Service(clock=0.0, load=(0.0, 0.0), off_centre=0.0), 600.0, seed)
     values = np.concatenate(list(run_day(vehicle, timetable)))
-    values = values[:, [channel_names(vehicle).index(c.name) for c in system.channels]]
+    values = values[:, [vehicle.channels.index(c.name) for c in system.channels]]
     starts = [k for k in range(0, len(values) - 100, 100) if timetable.at(timetable.speed, k / 100) > 8.0]
     chosen = np.random.default_rng(seed).permutation(starts)[:count]
     windows = np.stack([values[k : k + system.window] for k in chosen])

@@ -139,7 +139,7 @@ def chaos(minutes: float, every: float) -> Figures:
         url = server.database()
         watched = open_store(url)
         stack.callback(watched.close)
-        address, port = f"nats://127.0.0.1:{_free_port()}", _free_port()
+        address, port = f"nats://127.0.0.1:{postgres.free_port()}", postgres.free_port()
         fleet = ChaosFleet(server, url, program, address, port, folder)
         parts = fleet.parts()
         for part in parts:
@@ -375,9 +375,3 @@ def _listens(port: int) -> bool:
     except OSError:
         return False
     return True
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -9,7 +9,7 @@ from itertools import chain
 import numpy as np
 
 from sprung.benchmarks.generator.running import run_day
-from sprung.benchmarks.generator.timetable import Timetable, channel_names
+from sprung.benchmarks.generator.timetable import Timetable
 from sprung.benchmarks.generator.vehicle import Vehicle
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.tracking.tracker import TrackerState
@@ -48,7 +48,7 @@ def through(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Iterator[
 def _windows(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Iterator[tuple[FloatArray, list[int]]]:
     """Batches (B, T, C) and the numbers of their first samples, as the day is made piece by piece."""
     system = engine.system
-    columns = [channel_names(vehicle).index(c.name) for c in system.channels]
+    columns = [vehicle.channels.index(c.name) for c in system.channels]
     size, hop = system.window, system.hop
     held, first = np.zeros((0, len(columns))), 0  # samples that are held, and the number of the first of them
     for piece in chain(run_day(vehicle, timetable), [None]):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import can
@@ -26,7 +26,8 @@ class RecordedRide:
 
     path: Path
     truth: dict[str, float]  # of each parameter
-    values: FloatArray  # (T, C), in the order of the file's fields
+    values: FloatArray  # (T, C)
+    channels: list[str]  # their names
     lost: int = 0  # messages that were written by none
     foreign: int = 0  # frames of other identifiers
 
@@ -39,7 +40,7 @@ def make_ride(path: Path, seconds: float, seed: int) -> RecordedRide:
     WRITERS[path.suffix[1:]](path, vehicle, made.values, VEHICLE)
     of = {"stiffness": case.stiffness, "damping": case.damping}
     truth = {f"{element}.{quantity}": v for quantity in of for element, v in of[quantity].items()}
-    return RecordedRide(path, truth, made.values)
+    return RecordedRide(path, truth, made.values, vehicle.channels)
 
 
 def with_losses(ride: RecordedRide, path: Path, seed: int = 1) -> RecordedRide:
@@ -47,14 +48,14 @@ def with_losses(ride: RecordedRide, path: Path, seed: int = 1) -> RecordedRide:
     random = np.random.default_rng(seed)
     copy = _mcap_with_losses if path.suffix == ".mcap" else _can_with_losses
     lost, foreign = copy(ride.path, path, random)
-    return RecordedRide(path, ride.truth, ride.values, lost, foreign)
+    return replace(ride, path=path, lost=lost, foreign=foreign)
 
 
 def cut_off(ride: RecordedRide, path: Path, share: float) -> RecordedRide:
     """The first bytes of the file, as after a power failure."""
     whole = ride.path.read_bytes()
     path.write_bytes(whole[: round(share * len(whole))])
-    return RecordedRide(path, ride.truth, ride.values)
+    return replace(ride, path=path)
 
 
 def _mcap_with_losses(source: Path, path: Path, random: np.random.Generator) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import importlib
 import os
 import shutil
 import subprocess
@@ -83,6 +84,23 @@ def examples(thing: object, names: dict[str, object]) -> int:
 
 def test_the_example_of_the_package_runs() -> None:
     assert examples(sprung, {}) > 0
+
+
+def modules_with_examples() -> list[str]:
+    """Modules of the product whose functions have examples, but for the public ones, which have a test of their own."""
+    found = []
+    for folder in ("model", "replay", "service"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            if ">>> " in path.read_text(encoding="utf-8"):
+                found.append(".".join(("sprung", *path.relative_to(ROOT).with_suffix("").parts)))
+    public = {getattr(sprung, name).__module__ for name in sprung.__all__}
+    return [name for name in found if name.removesuffix(".__init__") not in public]
+
+
+@pytest.mark.parametrize("name", modules_with_examples())
+def test_the_examples_of_a_module_run(name: str) -> None:
+    done = doctest.testmod(importlib.import_module(name))
+    assert done.attempted and not done.failed
 
 
 def test_every_public_name_exists() -> None:

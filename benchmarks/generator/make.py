@@ -53,16 +53,12 @@ def _delayed(signal: Array, lag: float) -> Array:
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")[: signal.size]
 
 
-def _channels(vehicle: Vehicle) -> list[str]:
-    return [f"{w}.{q}" for q in ("displacement", "velocity") for w in vehicle.inputs] + list(vehicle.sensors)
-
-
 def _faulty(vehicle: Vehicle, case: Case, clean: Array, samples: int) -> Array:
     """The true signals with the fault of a measuring chain that changes them before noise, (samples, channels)."""
     values = clean[:samples].copy()
     if case.fault:
         channel, kind, value = case.fault
-        index = _channels(vehicle).index(channel)
+        index = vehicle.channels.index(channel)
         if kind == "sensor_gain":
             values[:, index] *= value
         elif kind == "sensor_lag":
@@ -78,11 +74,11 @@ def _noisy(vehicle: Vehicle, case: Case, values: Array) -> Array:
     scale = np.concatenate([vehicle.input_noise.ravel(), vehicle.sensor_noise])
     channel, kind, value = case.fault or ("", "", 0.0)
     if kind == "sensor_noise":
-        scale[_channels(vehicle).index(channel)] *= value
+        scale[vehicle.channels.index(channel)] *= value
     values = values + rng.normal(size=values.shape) * scale
     if kind == "sensor_stuck":
         start = min(int(value * SAMPLE_RATE), len(values) // 2)
-        index = _channels(vehicle).index(channel)
+        index = vehicle.channels.index(channel)
         values[start:, index] = values[start, index]
     return values
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, signal
 
-from sprung.benchmarks.generator.timetable import STEP, Timetable, channel_names
+from sprung.benchmarks.generator.timetable import STEP, Timetable
 from sprung.benchmarks.generator.track import LONGEST, LOW_TRACK, SHORTEST, errib176
 from sprung.benchmarks.generator.vehicle import Vehicle
 
@@ -154,12 +154,12 @@ def modes(vehicle: Vehicle, log_ratio: Array, load: float, centre: float, spread
 
 
 def run_day(vehicle: Vehicle, timetable: Timetable, level: float = LOW_TRACK) -> Iterator[Array]:
-    """What all channels measure at 100 Hz: arrays (T, C), one after the other, C as `channel_names` has them."""
+    """What all channels measure at 100 Hz: arrays (T, C), one after the other, C as `Vehicle.channels` has them."""
     duration = float(timetable.time[-1])
     fine = np.arange(round(duration * RATE) + 1) / RATE
     place = _place(timetable, fine)
     rails = Rails(timetable, float(place[-1]) + 60.0, level)
-    names, noise = channel_names(vehicle), np.concatenate([vehicle.input_noise.ravel(), vehicle.sensor_noise])
+    names, noise = vehicle.channels, np.concatenate([vehicle.input_noise.ravel(), vehicle.sensor_noise])
     rng = np.random.default_rng([timetable.seed, 3])
     state = np.zeros(2 * len(vehicle.inertia))
     held, held_from, taken = np.zeros((0, len(names))), 0, 0

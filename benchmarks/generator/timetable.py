@@ -115,15 +115,10 @@ class Timetable:
         return np.asarray(out)
 
 
-def channel_names(vehicle: Vehicle) -> list[str]:
-    """In the order of `Vehicle.places`: displacements, velocities, sensors."""
-    return [f"{w}.{q}" for q in ("displacement", "velocity") for w in vehicle.inputs] + list(vehicle.sensors)
-
-
 def nodes(vehicle: Vehicle) -> list[str]:
     """The node that sends each channel: topics of one body come from one clock."""
     return [place.get("mcap", name).strip("/").split("/")[0] for name, place in
-            zip(channel_names(vehicle), vehicle.places, strict=True)]  # fmt: skip
+            zip(vehicle.channels, vehicle.places, strict=True)]  # fmt: skip
 
 
 def draw_timetable(vehicle: Vehicle, service: Service, seconds: float, seed: int, start: float = 0.0) -> Timetable:
@@ -139,7 +134,7 @@ def draw_timetable(vehicle: Vehicle, service: Service, seconds: float, seed: int
     mean = rng.uniform(*service.temperature)
     air = mean + service.daily_swing * np.sin(2 * np.pi * (start + time - 9 * 3600) / 86400)
     oil = air + service.warm_up * (1 - np.exp(-time / 1200.0))
-    E, C = len(vehicle.elements), len(channel_names(vehicle))
+    E, C = len(vehicle.elements), len(vehicle.channels)
     clocks = {node: float(rng.uniform(-service.clock, service.clock)) for node in dict.fromkeys(nodes(vehicle))}
     place = np.cumsum(speed) * STEP
     spread = _spreads(np.random.default_rng([seed, 5]), service, load)

@@ -35,6 +35,11 @@ class Vehicle:
     sensor_noise: Array  # m/s^2, shape (S,)
     places: tuple[dict[str, str], ...]  # where a recording keeps each channel: displacements, velocities, sensors
 
+    @property
+    def channels(self) -> list[str]:
+        """Names in the order of `places`."""
+        return [f"{w}.{q}" for q in ("displacement", "velocity") for w in self.inputs] + list(self.sensors)
+
     def on_body(self, body: str) -> slice:
         """Rows of a body's three degrees of freedom."""
         first = 3 * self.bodies.index(body)

@@ -109,7 +109,7 @@ def server(durable: bool = False) -> Iterator[PostgresServer]:
         user = _user()
         if os.geteuid() == 0 and user is not None:
             shutil.chown(folder, user=user)
-        found = PostgresServer(folder, _free_port(), durable)
+        found = PostgresServer(folder, free_port(), durable)
         found.initdb()
         found.start()
         try:
@@ -127,7 +127,8 @@ def _user() -> str | None:
     return None
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """A port of this machine that nothing listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

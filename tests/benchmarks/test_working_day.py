@@ -9,7 +9,7 @@ import pytest
 from sprung.benchmarks.generator import read_vehicle
 from sprung.benchmarks.generator.dayfile import write_day
 from sprung.benchmarks.generator.running import Rails, modes, run_day
-from sprung.benchmarks.generator.timetable import Fault, Service, channel_names, draw_timetable
+from sprung.benchmarks.generator.timetable import Fault, Service, draw_timetable
 from sprung.benchmarks.generator.track import LOW_TRACK, errib176
 from sprung.model.identification.identify import Identifier
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
@@ -39,7 +39,7 @@ def test_a_standing_train_shows_noise_and_a_running_one_its_own_values() -> None
     noise = np.concatenate([VEHICLE.input_noise.ravel(), VEHICLE.sensor_noise])
     assert np.allclose(values[50:350].std(axis=0) / noise, 1.0, atol=0.2)  # doors are still closed
     system = load_system()
-    columns = [channel_names(VEHICLE).index(channel.name) for channel in system.channels]
+    columns = [VEHICLE.channels.index(channel.name) for channel in system.channels]
     windows = np.stack([values[at : at + 100, columns] for at in range(6000, 7900, 100)])
     found = Identifier(system).identify(windows)
     assert all(e.adequate for e in found)
@@ -78,8 +78,8 @@ def test_faults_change_what_they_name() -> None:
     row = 12 + VEHICLE.elements.index("secondary_1l")
     assert change[row] == pytest.approx(np.log(0.8))
     assert np.count_nonzero(np.abs(change) > 1e-6) == 1
-    gains = timetable.gains(channel_names(VEHICLE), np.array([0.0, 20.0, 40.0]))
-    assert gains[:, channel_names(VEHICLE).index("bogie1_1l")] == pytest.approx([1.0, 1.05**0.5, 1.05], rel=1e-6)
+    gains = timetable.gains(VEHICLE.channels, np.array([0.0, 20.0, 40.0]))
+    assert gains[: (VEHICLE).index("bogie1_1l")] == pytest.approx([1.0, 1.05**0.5, 1.05], rel=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["blf", "mcap"])
