@@ -39,6 +39,7 @@ _MARGIN = 2  # samples that a delay costs at either end beyond itself
 _LATE = (-0.045, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.045)  # s: delays too large for a linear step
 _LATE_TRIED = 3  # windows of a batch that they are tried on; others begin with what these have in common
 _TRIALS = 3  # of such delays, reversed signs or exchanges, by their squares at the nominal values
+_TOLERATED = 3.0  # of what a data sheet leaves open; channels that are all off by less are none of them wrong
 _SLIGHT = 0.1  # of what a data sheet leaves open; less is not taken back
 
 
@@ -212,13 +213,13 @@ class Explainer:
         plain = [e for e in found.values() if self._key(e.point)]
         if len(plain) < 2:
             return None
-        total = np.diag(self._std**-2.0)
+        total = np.zeros((len(self._std), len(self._std)))
         pull = np.zeros(len(total))
         for e in plain:
             information = e.refined.information[0]
             total += information
             pull += e.refined.score[0] + information @ np.where(self._measured, e.point, 0.0)
-        point = np.where(self._measured, np.linalg.solve(total, pull), 0.0)
+        point = np.where(self._measured, self._most_likely(pull, total), 0.0)
         return np.where(np.abs(point) > _SLIGHT * self._std, point, 0.0)
 
     def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, FaultExplanation]:
@@ -227,8 +228,12 @@ class Explainer:
         found = {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
         left = np.array([i for i in plain if i not in found], dtype=np.int64)
         if len(left) and len(self._clocks) > 1:
-            again = self._by_steps(windows[left], [()] * len(left), clocks=True)
+            again = self._by_steps(windows[left], [()] * len(left), step=self._clock_step)
             found |= {int(left[i]): e for i, e in again.items()}
+            left = np.array([i for i in left if i not in found], dtype=np.int64)
+        if len(left):
+            again = self._by_steps(windows[left], [()] * len(left), step=self._step_of_all)
+            found |= {int(left[i]): self._within_tolerance(e) for i, e in again.items()}
         still = [i for i, faults in enumerate(stuck) if faults]
         found |= dict(zip(still, self._without(windows[still], [stuck[i] for i in still]), strict=True))
         late = 0
@@ -247,10 +252,10 @@ class Explainer:
         known: list[tuple[MeasurementFault, ...]],
         start: FloatArray | None = None,
         *,
-        clocks: bool = False,
+        step: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
     ) -> dict[int, FaultExplanation]:
-        """One deviation at a time, the one with the most evidence, or all `clocks` together; `known`: faults that were
-        corrected before."""
+        """One deviation at a time, the one with the most evidence, or what `step` makes of score and information;
+        `known`: faults that were corrected before."""
         found: dict[int, FaultExplanation] = {}
         active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.deviations)))
         if start is not None:
@@ -262,7 +267,7 @@ class Explainer:
             going = []
             for i, one in zip(active, parts, strict=True):
                 chi_square, weight = float(one.chi_square[0]), (one.score[0], one.information[0])
-                step = self._clock_step(*weight) if clocks else self._step(*weight)[0]
+                further = self._step(*weight)[0] if step is None else step(*weight)
                 good = bool(fits(one)[0])
                 if good:
                     found[int(i)] = FaultExplanation(
@@ -270,7 +275,7 @@ class Explainer:
                     )
                 if self.apart(*weight) if good else chi_square < _BETTER * before[i]:
                     before[i] = chi_square
-                    point[i] = self._moved(point[i], step)
+                    point[i] = self._moved(point[i], further)
                     if self._credible(point[i]):
                         going.append(i)
             active = np.array(going, dtype=np.int64)
@@ -365,8 +370,27 @@ class Explainer:
     def _clock_step(self, score: FloatArray, information: FloatArray) -> FloatArray:
         """The delays of all clocks at their most likely sizes, shape (H,)."""
         V = self._clocks
-        prior = np.diag(((V * self._std).max(axis=1)) ** -2.0)
-        return np.asarray(V.T @ np.linalg.solve(V @ information @ V.T + prior, V @ score))
+        w = (V * self._std).max(axis=1)
+        precision = np.eye(len(w)) + V @ information @ V.T * np.outer(w, w)
+        return np.asarray(V.T @ (w * np.linalg.solve(precision, w * (V @ score))))
+
+    def _step_of_all(self, score: FloatArray, information: FloatArray) -> FloatArray:
+        """All gains and delays at their most likely sizes within what data sheets leave open, shape (H,)."""
+        try:
+            return np.where(self._measured, self._most_likely(score, information), 0.0)
+        except np.linalg.LinAlgError:  # of a window whose motion has run away under a law
+            return np.zeros(len(score))
+
+    def _most_likely(self, score: FloatArray, information: FloatArray) -> FloatArray:
+        """Deviations (H,) at their most likely sizes within what data sheets leave open, which may be nothing."""
+        S = self._std
+        precision = np.eye(len(S)) + information * np.outer(S, S)
+        return np.asarray(S * np.linalg.solve(precision, S * score))
+
+    def _within_tolerance(self, cause: FaultExplanation) -> FaultExplanation:
+        """An explanation by all gains and delays together; only what no data sheet leaves open is a fault."""
+        far = self._measured & (np.abs(cause.point) > _TOLERATED * self._std)
+        return replace(cause, faults=self._named(np.where(far, cause.point, 0.0)))
 
     def apart(self, score: FloatArray, information: FloatArray) -> bool:
         """Whether a window that fits should be refined elsewhere: it speaks clearly for a sizeable deviation."""

@@ -11,6 +11,7 @@ from scipy.interpolate import make_interp_spline
 
 from sprung.model.identification.deviations import deviations
 from sprung.model.identification.excitation import simulate_runs
+from sprung.model.identification.faults import Explainer
 from sprung.model.identification.identify import Identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.signals import FloatArray, MeasurementFault
@@ -196,3 +197,19 @@ def test_standing_windows_are_refined_once_and_the_first_of_many_start_the_other
     for one, other in zip(found[3:], alone, strict=False):
         off = (one.log_ratio - other.log_ratio) / np.sqrt(other.covariance.diagonal())
         assert np.abs(off).max() < 0.2
+
+
+def test_channels_that_are_all_off_within_their_data_sheets_leave_windows_that_fit(
+    system: System, samples: FloatArray
+) -> None:
+    """3 % each is more than a window bears that fits only with all of them, and no fault of any one."""
+    gains = 1 + 0.03 * np.random.default_rng(5).choice([-1.0, 1.0], 28)
+    values, identifier = windows(system, samples * gains, hop=100)[:4], Identifier(system)
+    with patch.object(Explainer, "_step_of_all", lambda self, score, information: 0 * score):
+        before = identifier.examine(values, np.ones(4, dtype=bool))
+    after = identifier.examine(values, np.ones(4, dtype=bool))
+    assert sum(e.adequate for e in before) < 4
+    assert all(e.adequate and not e.faults for e in after)
+    truth = np.random.default_rng(12).uniform(-0.15, 0.15, 24)
+    for one in after:
+        assert np.abs((one.log_ratio - truth) / np.sqrt(one.covariance.diagonal())).max() < 4.0
