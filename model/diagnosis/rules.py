@@ -129,6 +129,7 @@ class ScreeningRules:
 
     slowest: float = rule(0.5, "Hz, of fundamentals; derived: rail joints at walking pace", 0.3, 1.0)
     fastest: float = rule(21.0, "Hz, of fundamentals; derived: wheels of 0.92 m at 60 m/s", 15.0, 30.0)
+    lowest_line: int = rule(2, "bins, of a line; derived: below, it is a drift", 1, 4)
     harmonics: int = rule(2, "that are seen; derived: one alone is a line", 2, 3)
     reach: int = rule(24, "bins; derived: a median of 49 knows the level to 18 %", 12, 48)
     colour: float = rule(2.5, "by which exact columns may raise a score; chosen", 1.5, 4.0)

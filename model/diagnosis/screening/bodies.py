@@ -16,7 +16,7 @@ from sprung.model.diagnosis.response.forward import structure_of
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ScreeningRules
 from sprung.model.diagnosis.screening.families import LINE, MASS, MODE
-from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
+from sprung.model.diagnosis.screening.score import MEDIAN_OF_CHI_SQUARE, Candidate, Projector, ScalarResponse
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
 from sprung.model.mechanics import ACCELERATION, VELOCITY
 from sprung.model.signals import FloatArray
@@ -111,7 +111,7 @@ def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Ca
     A sine at the frequency of a bin fills that bin, half way between two it fills both in opposite phase.  Scores are
     normalised by their local median where it exceeds noise, so that broadband misfits are not taken for lines.
     """
-    grid = projector.grid
+    grid, rules = projector.grid, projector.problem.rules.screening
     system = projector.problem.system
     r = projector.complex_residual
     best: tuple[float, float, str] = (0.0, 0.0, "")
@@ -125,8 +125,8 @@ def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Ca
         between = np.abs(b[1:] - b[:-1]) ** 2 / (n[1:] + n[:-1])
         scores = np.empty(2 * len(on) - 1)
         scores[0::2], scores[1::2] = on, between
-        scores[:4] = 0.0
-        scores = scores / np.maximum(1.0, _local_median(scores, projector.problem.rules.screening.reach) / 1.386)
+        scores[: 2 * rules.lowest_line] = 0.0
+        scores = scores / np.maximum(1.0, _local_median(scores, rules.reach) / MEDIAN_OF_CHI_SQUARE)
         i = int(np.argmax(scores))
         count += len(scores)
         if scores[i] > best[0]:

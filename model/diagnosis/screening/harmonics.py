@@ -18,13 +18,12 @@ from sprung.model.diagnosis.response.terms import Term, supports
 from sprung.model.diagnosis.rules import ScreeningRules
 from sprung.model.diagnosis.screening.families import HARMONIC
 from sprung.model.diagnosis.screening.places import wheelsets
-from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
+from sprung.model.diagnosis.screening.score import MEDIAN_OF_CHI_SQUARE, Candidate, Projector, ScalarResponse
 from sprung.model.laws import CLOCK_LEAD, Law, SupportLaw
 from sprung.model.signals import FloatArray
 
 _FINER = 8  # frequencies per bin: the last harmonic drifts by half a turn at most over the recording
 _PHASES = 64
-_MEDIAN = 1.386  # of chi-square with two degrees of freedom
 
 
 def harmonic_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
@@ -63,7 +62,7 @@ def _products(
     Both are normalised by the local level of the residual over noise.
     """
     scores = np.abs(channel.product) ** 2 / np.maximum(channel.size, 1e-300)
-    colour = np.maximum(1.0, median_filter(scores, size=2 * rules.reach + 1, mode="nearest") / _MEDIAN)
+    colour = np.maximum(1.0, median_filter(scores, size=2 * rules.reach + 1, mode="nearest") / MEDIAN_OF_CHI_SQUARE)
     product, size, bins = channel.product / colour, channel.size / colour, len(colour)
     series = scipy.fft.ifft(np.pad(product, (0, grid.samples - bins))).real * np.sqrt(grid.samples)
     spectrum = scipy.fft.rfft(series, _FINER * grid.samples)

@@ -23,6 +23,7 @@ from sprung.model.diagnosis.rules import RULES, ScreeningRules
 from sprung.model.diagnosis.screening.families import Family
 from sprung.model.signals import FloatArray
 
+MEDIAN_OF_CHI_SQUARE = 1.386  # with two degrees of freedom
 _ROUNDING = 1e-7
 
 
