@@ -1,4 +1,4 @@
-"""Excess noise of single channels, judged against channels of the same kind."""
+"""Excess noise of single channels, judged against the other sensors, or against the same channel of other supports."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     white = upper_ratio(state, known) > 1 + rules.white * (inside - 1)
     inaccuracy = rules.inaccuracy * np.mean((after.simulated - before.simulated) ** 2, axis=0)
     white &= (inside**2 - np.median(inside) ** 2) * known**2 > inaccuracy
-    found += _outliers(names, inside, white, count, rules)
+    found += outliers(names, inside, white, count, rules)
     pairs = state.problem.part.pairs
     if len(pairs):
         supports = [state.signals.support_names[i] for i in pairs]
         d = (noise.displacement / declared.displacement)[pairs]
         v = (noise.velocity / declared.velocity)[pairs]
         every = np.ones(len(pairs), dtype=bool)
-        found += _outliers([f"{n}.displacement" for n in supports], d, every, rules.displacement * count, rules)
-        found += _outliers([f"{n}.velocity" for n in supports], v, every, rules.velocity * count, rules)
+        found += outliers([f"{n}.displacement" for n in supports], d, every, rules.displacement * count, rules)
+        found += outliers([f"{n}.velocity" for n in supports], v, every, rules.velocity * count, rules)
     return tuple(found)
 
 
@@ -54,10 +54,13 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     return found
 
 
-def _outliers(
+def outliers(
     names: list[str], ratio: np.ndarray, white: np.ndarray, count: float, rules: NoiseRules
 ) -> list[NoiseFault]:
-    """Outliers among ratios of noise to declared noise."""
+    """Outliers among ratios of noise to declared noise, each by the median of the others; fewer than two say nothing.
+
+    white: whether the noise goes on above the compared band.  count: bins that inform on it.
+    """
     found = []
     for i, name in enumerate(names):
         peers = [j for j in range(len(names)) if j != i]

@@ -1,0 +1,40 @@
+"""Which channels count as noisier than their peers."""
+
+import numpy as np
+import pytest
+
+from sprung.model.diagnosis.investigation.excess_noise import outliers
+from sprung.model.diagnosis.rules import RULES
+
+NAMES = ["a", "b", "c", "d", "e"]
+EVERY = np.ones(5, dtype=bool)
+RULE = RULES.noise
+
+
+def test_chance_hardly_ever_makes_an_outlier() -> None:
+    random, bins, found = np.random.default_rng(1), 400, 0
+    for _ in range(500):
+        level = np.sqrt(np.mean(random.exponential(1.0, (bins, 5)), axis=0))
+        found += len(outliers(NAMES, level, EVERY, bins, RULE))
+    assert found == 0
+
+
+@pytest.mark.parametrize("usual", [0.5, 1.0, 3.0])
+def test_a_noisy_channel_is_found_whatever_all_have_in_common(usual: float) -> None:
+    ratio = usual * np.array([1.01, 0.99, 1.5, 1.0, 1.02])
+    (found,) = outliers(NAMES, ratio, EVERY, 400, RULE)
+    assert (found.location, found.ratio) == ("c", pytest.approx(1.5 * usual))
+    assert found.usual == pytest.approx(1.005 * usual)
+    assert found.sigmas == pytest.approx(np.log(1.5 / 1.005) * np.sqrt(800))
+    assert found.p_value < 1e-6
+
+
+def test_what_ends_with_the_band_is_no_noise_and_two_channels_cannot_be_told_apart() -> None:
+    ratio = np.array([1.0, 1.0, 2.0, 1.0, 1.0])
+    assert not outliers(NAMES, ratio, EVERY & (ratio < 2), 400, RULE)
+    assert not outliers(["a", "b"], ratio[1:3], EVERY[:2], 400, RULE)
+
+
+def test_a_significant_ratio_that_no_workshop_would_mind_is_none() -> None:
+    assert not outliers(NAMES, np.array([1.0, 1.0, 0.99 * RULE.least, 1.0, 1.0]), EVERY, 1e6, RULE)
+    assert not outliers(NAMES, np.array([1.0, 1.0, 1.5, 1.0, 1.0]), EVERY, 20, RULE)  # and one of few bins
