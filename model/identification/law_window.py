@@ -331,9 +331,10 @@ class LawWindows:
         B, _, T, _ = load.shape
         slope = self.slope @ load
         series = (load[:, :, :-1], slope[:, :, :-1], load[:, :, 1:], slope[:, :, 1:])
-        shown = (gain @ values.flatten(2) for gain, values in zip(steps.force_response, series, strict=True))
-        total: Tensor = sum(shown)  # type: ignore[assignment]
-        return total.view(B, -1, T - 1, load.shape[3]).transpose(1, 2)
+        first, *others = (gain @ values.flatten(2) for gain, values in zip(steps.force_response, series, strict=True))
+        for other in others:
+            first += other
+        return first.view(B, -1, T - 1, load.shape[3]).transpose(1, 2)
 
     def by_drive(
         self,
