@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, vehicle_name
+from sprung.service.cli.plain import PlainTyper
 from sprung.service.processes.threads import one_thread_each
 
 Place = Annotated[str, typer.Argument(help="Folder of recordings, or an address such as s3://bucket/folder.")]
@@ -16,7 +17,7 @@ Workers = Annotated[
     int | None, typer.Option("--workers", min=1, help="Cores of a Ray that is started for this; default: all.")
 ]
 
-fleet = typer.Typer(help="Many vehicles, many recordings, many machines.", no_args_is_help=True)
+fleet = PlainTyper(help="Many vehicles, many recordings, many machines.", no_args_is_help=True)
 
 
 def edge(
@@ -95,9 +96,8 @@ def backfill(
 ) -> int:
     """Compute the history of many recordings anew.
 
-    In parallel; it replaces the existing one.
-
-    Restarted, it continues where it stopped.  Unreadable files are reported at the end.
+    In parallel; it replaces the existing one.  Restarted, it continues where it stopped.  Unreadable files are
+    reported at the end.
     """
     one_thread_each()
     from sprung.service.cli.fleet import run_backfill

@@ -9,8 +9,9 @@ from typing import Any
 import typer
 from typer.core import TyperCommand
 
-TYPE = re.compile(r" <(?:list\[)?\w+\]?>")  # <list[Path]> behind a name that says it already
-BRACED = re.compile(r"\{([A-Z]+)(?:\.\.\.)?\}")
+TYPE = re.compile(r" <(?:list\[)?[\w ]+\]?>")  # <list[Path]> behind a name that says it already
+WORDS = {"int": "N", "float": "N", "path": "PATH"}  # for values of such types; TEXT for others
+BRACED = re.compile(r"\{(\w+)(?:\.\.\.)?\}")
 
 
 class PlainCommand(TyperCommand):
@@ -21,15 +22,22 @@ class PlainCommand(TyperCommand):
         write = formatter.write_dl
 
         def write_plain(rows: Any, *given: Any, **options: Any) -> None:
-            write([(_plain(name), text) for name, text in rows], *given, **options)
+            write([(_plain(_with_value(name)), text) for name, text in rows], *given, **options)
 
         formatter.write_dl = write_plain
         super().format_help(ctx, formatter)
         formatter.buffer[:] = [_plain(part) for part in formatter.buffer]
 
 
+def _with_value(name: str) -> str:
+    """An option's name with a word for what it takes: `--days N`; a flag's or an argument's as it is."""
+    if not name.startswith("-") or name.endswith("<bool>"):
+        return name
+    return TYPE.sub(lambda kind: f" {next((w for t, w in WORDS.items() if t in kind[0].lower()), 'TEXT')}", name)
+
+
 def _plain(text: str) -> str:
-    return BRACED.sub(r"\1", TYPE.sub("", text))
+    return BRACED.sub(lambda name: name[1].upper(), TYPE.sub("", text))
 
 
 class PlainTyper(typer.Typer):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,7 +21,10 @@ from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.identification.estimator import Estimator, new_estimator
 from sprung.model.system import MANCHESTER, System
 from sprung.service.cli import describe, main
+from sprung.service.cli.app import app
 from sprung.service.cli.bench import parse
+from sprung.service.cli.fleet_commands import fleet
+from sprung.service.cli.store_commands import token
 from sprung.service.errors import UserError
 from sprung.service.monitoring.engine import Engine, make_tracker
 from sprung.service.settings import Settings, settings_with
@@ -293,6 +297,15 @@ def test_help_describes_every_command_in_one_line_of_80_columns(
     assert len(commands) > 3
     assert all(line.startswith("  ") or number == 0 for number, line in enumerate(commands))
     assert all(line.endswith(".") and not line.endswith("...") for line in commands)
+
+
+def test_help_of_every_command_names_no_python_types(capsys: pytest.CaptureFixture[str]) -> None:
+    groups = {(): app, ("fleet",): fleet, ("token",): token}
+    for group, commands in groups.items():
+        for command in commands.registered_commands:
+            assert command.callback is not None
+            assert main([*group, command.name or command.callback.__name__, "--help"]) == 0
+            assert not re.search(r"<(int|str|float|bool|path|list|url)|^Usage:.*\{", capsys.readouterr().out, re.I)
 
 
 def test_bench_without_a_name_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
