@@ -233,7 +233,7 @@ class Attribution:
         whole, members = replace(drift, change=drift.whole), self._of_kind(self.kinds[i])
         along = self._changed_with(i, whole, members)
         in_a_kind = any(name and "*" in name and fnmatchcase(self.names[i], name) for name in alarmed)
-        if in_a_kind and along:
+        if in_a_kind and (along or _between(float(whole.change[i]), _common(whole, members)[0])):
             return None
         since = int((state.changes.up_since if state.changes.active[i] > 0 else state.changes.down_since)[i])
         deviations = self._alternatives(i, state, drift, since, now)
@@ -415,6 +415,11 @@ def _common(drift: Drift, members: IntArray) -> tuple[float, float]:
     """Median change of some parameters, and its standard deviation."""
     change, std = drift.change[members], drift.std[members]
     return float(np.nanmedian(change)), float(1.25 * np.sqrt(np.nanmean(std**2) / len(members)))
+
+
+def _between(change: float, common: float) -> bool:
+    """Whether a change lies between none and the common one: it follows that, or has not come along."""
+    return bool(0 <= change * np.sign(common) <= abs(common))
 
 
 def counted(stuck: Sequence[Stuck], found: Sequence[tuple[str, FaultKind, float]], time: int) -> tuple[Stuck, ...]:

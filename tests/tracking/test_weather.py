@@ -1,7 +1,7 @@
 """Weather, load and speed: what they do to healthy parameters is learned, and hides no change beside it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -125,6 +125,23 @@ def test_oil_that_leaves_all_dampers_at_once_is_one_message() -> None:
     state = day(rng, tracker().initial_state(), 160, lambda k: lost * np.clip((k - 100) / 10, 0, 1), lambda k: None)
     assert [alarm.parameter for alarm in state.active] == ["*.damping"]
     assert state.active[0].change == pytest.approx(-0.12, abs=0.02)
+
+
+def test_a_damper_that_is_still_followed_to_the_common_change_has_no_alarm_of_its_own() -> None:
+    rng, follow = np.random.default_rng(6), tracker()
+    gone = np.zeros(24)
+    gone[DAMPERS] = np.log(0.8)
+    state = day(rng, follow.initial_state(), 60, lambda k: np.zeros(24), lambda k: None)
+    state = day(rng, state, 10, lambda k: gone, lambda k: None, first=60)
+    assert [alarm.parameter for alarm in state.active] == ["*.damping"]
+    first, mean, active = DAMPERS.start, state.belief.mean.copy(), state.changes.active.copy()
+    for share, alone in ((0.4, []), (2.0, [NAMES[first]])):
+        mean[first], active[first] = share * np.log(0.8), -1
+        late = replace(
+            state, belief=replace(state.belief, mean=mean.copy()), changes=replace(state.changes, active=active)
+        )
+        alarms = follow._attribution.updated(late, follow._fusion.drift(late), None, state.time or 0)
+        assert [alarm.parameter for alarm in alarms if alarm.closed is None] == ["*.damping", *alone]
 
 
 def test_a_damper_that_stays_worn_does_not_keep_the_alarm_of_all_open() -> None:
