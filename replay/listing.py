@@ -66,7 +66,7 @@ def _columns(path: Path, extension: str, time: TimeColumn, notes: list[str]) -> 
     """The columns of numbers, but for those of times, and where the times are; rows are counted when nowhere."""
     if extension in series.KINDS:
         with series.opened(path) as columns:
-            return _series(path, columns, time, notes)
+            return _series(path, _first_sheets(columns, notes), time, notes)
     if extension in TEXT_TABLES:
         layout, _ = csvtable.read_layout(path)
         names = [n if layout.names.count(n) == 1 else str(i + 1) for i, n in enumerate(layout.names)]
@@ -83,6 +83,14 @@ def _columns(path: Path, extension: str, time: TimeColumn, notes: list[str]) -> 
         notes.append(NO_TIME)
         time = TimeColumn(rate=1.0)
     return [(name, unit) for name, unit in listed if name != times], time
+
+
+def _first_sheets(columns: list[Column], notes: list[str]) -> list[Column]:
+    """Of arrays with more than two axes, the series of the first sheet: the others look alike, often in thousands."""
+    others = [column.name for column in columns if column.sheet]
+    if others:
+        notes.append(f"{len(others)} more series of further sheets are addressed alike: {others[0]} to {others[-1]}")
+    return [column for column in columns if not column.sheet]
 
 
 def _series(path: Path, columns: list[Column], time: TimeColumn, notes: list[str]) -> tuple[Named, TimeColumn]:

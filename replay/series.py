@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from sprung.replay.stamps import SECOND
 from sprung.replay.tables import Column, EvenTimes, whole
 
 DEEPEST = 8  # structures inside each other
-WIDEST = 512  # columns of one matrix
+WIDEST = 10_000  # series of one array
 
 
 @contextmanager
@@ -90,20 +91,40 @@ def _flat(content: Any, name: str = "", depth: int = 0) -> Iterator[Column]:
             values = np.array([_as_float(value) for value in values.ravel()]).reshape(values.shape)
         except (TypeError, ValueError):
             return
-    yield from of_matrix(name, values)
+    yield from of_array(name, values)
 
 
-def of_matrix(name: str, values: NDArray[Any]) -> Iterator[Column]:
-    """A vector, or the columns of a matrix (its rows where it lies on its side), as columns."""
-    if values.dtype.kind not in "fiubUM" or values.ndim not in (1, 2) or max(values.shape, default=0) < 2:
+def of_array(name: str, values: NDArray[Any]) -> Iterator[Column]:
+    """The series of an array of numbers, along its longest axis."""
+    if values.dtype.kind in "fiubUM":
+        for suffix, sheet, at in _series_in(values.shape):
+            yield replace(whole(name + suffix, values[at(slice(None))], None), sheet=sheet)
+
+
+Place = Callable[[slice], tuple[int | slice, ...]]
+
+
+def _series_in(shape: tuple[int, ...]) -> Iterator[tuple[str, int, Place]]:
+    """(what follows the array's name, number of its sheet, index of a stretch) of every series: nothing for a vector,
+    `(:,2)` in a matrix, `(:,2,5)` on the fifth sheet of an array with three axes.
+
+    The longest axis is the time.  Where it is the last one, the others count backwards, as in HDF5 files of MATLAB.
+    """
+    along = int(np.argmax(shape)) if shape else 0
+    if max(shape, default=0) < 2 or math.prod(shape) // shape[along] > WIDEST:
         return
-    if values.ndim == 1 or 1 in values.shape:
-        yield whole(name, values.reshape(-1), None)
-        return
-    upright = values if values.shape[0] >= values.shape[1] else values.T
-    if upright.shape[1] <= WIDEST:
-        for i in range(upright.shape[1]):
-            yield whole(f"{name}(:,{i + 1})", upright[:, i], None)
+    others = [axis for axis in range(len(shape)) if axis != along]
+    if along == len(shape) - 1:
+        others.reverse()
+    single = math.prod(shape) == shape[along]
+    for i, index in enumerate(product(*(range(shape[axis]) for axis in reversed(others)))):
+        place = dict(zip(reversed(others), index, strict=True))
+        suffix = "" if single else f"(:,{','.join(str(place[axis] + 1) for axis in others)})"
+        yield suffix, i // shape[others[0]] if others else 0, _place(along, place)
+
+
+def _place(along: int, others: Mapping[int, int]) -> Place:
+    return lambda part: tuple(part if axis == along else others[axis] for axis in range(len(others) + 1))
 
 
 @contextmanager
@@ -154,15 +175,9 @@ def _datasets(name: str, item: Any) -> Iterator[Column]:
             if item.dtype[field].kind in "fiub":
                 yield Column(f"{name}.{field}", len(item), _field(item, field), unit)
         return
-    if item.dtype.kind not in "fiub" or item.ndim not in (1, 2) or max(item.shape, default=0) < 2:
-        return
-    if item.ndim == 1:
-        yield Column(name, len(item), lambda a, b: item[a:b], unit)
-        return
-    length, width, lying = max(item.shape), min(item.shape), item.shape[0] < item.shape[1]
-    for i in range(width if width <= WIDEST else 0):
-        read = _across(item, i) if lying else _down(item, i)
-        yield Column(name if width == 1 else f"{name}(:,{i + 1})", length, read, unit)
+    if item.dtype.kind in "fiub":
+        for suffix, sheet, at in _series_in(item.shape):
+            yield Column(name + suffix, max(item.shape), _stretch(item, at), unit, sheet=sheet)
 
 
 Read = Callable[[int, int], NDArray[Any]]
@@ -172,12 +187,8 @@ def _field(item: Any, field: str) -> Read:
     return lambda a, b: item[a:b][field]
 
 
-def _across(item: Any, i: int) -> Read:
-    return lambda a, b: item[i, a:b]
-
-
-def _down(item: Any, i: int) -> Read:
-    return lambda a, b: item[a:b, i]
+def _stretch(item: Any, at: Place) -> Read:
+    return lambda a, b: item[at(slice(a, b))]
 
 
 @contextmanager
@@ -235,7 +246,7 @@ def _lvm(path: Path) -> Iterator[list[Column]]:
 
 @contextmanager
 def _numpy(path: Path) -> Iterator[list[Column]]:
-    yield [column for name, values in numpyfile.arrays(path) for column in of_matrix(name, values)]
+    yield [column for name, values in numpyfile.arrays(path) for column in of_array(name, values)]
 
 
 KINDS: dict[str, Callable[[Path], Any]] = {

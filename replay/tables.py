@@ -47,6 +47,7 @@ class Column:
     read: Callable[[int, int], NDArray[Any]]  # rows a to b
     unit: str | None = None
     clock: EvenTimes | None = None
+    sheet: int = 0  # of an array with more than two axes, from 0
 
     @property
     def group(self) -> str:

@@ -15,6 +15,7 @@ from rich.text import Text
 from sprung.model.exchange.matrices import read_matrices
 from sprung.model.identification.identify import identifiability
 from sprung.model.identification.linearise import PRIOR_STD
+from sprung.model.schema import ForceInput
 from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.systemfile import json_schema
 from sprung.model.text import counted
@@ -120,6 +121,8 @@ def _parameters(system: System, deviations: Any) -> Table:
         under = "without any measured input, of vibration well above the noise,"
     elif system.on_track:
         under = "on an average unmeasured track"
+    elif all(isinstance(source, ForceInput) for source in system.file.inputs.values()):
+        under = "under white forces, well above the sensors' noise,"
     title = f"What one window of {system.window / system.sample_rate:g} s {under} determines"
     table = Table("parameter", "nominal", "standard deviation", "", title=title, title_justify="left")
     for parameter, std in zip(system.parameters, np.asarray(deviations), strict=True):

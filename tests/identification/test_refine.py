@@ -185,6 +185,26 @@ def test_magnitudes_are_the_absolute_discrete_fourier_transform() -> None:
     assert np.allclose(features[1, :, 2], np.abs(np.fft.fft(signal[1, :, 2].numpy()))[:17])
 
 
+def test_identifiability_under_a_measured_force_covers_all_modes() -> None:
+    """A model building whose modes are far above those of a vehicle."""
+    system = parse_system("""
+name: model building
+sample_rate: 320
+window: 320
+bodies: {base: {mass: 6.9}, first: {mass: 6.5}, second: {mass: 6.5}}
+inputs: {shaker: {kind: force, body: base, csv: f, noise: 0.1}}
+elements:
+  rail: {upper: base, lower: ground, stiffness: 600, damping: 20}
+  lower: {upper: first, lower: base, stiffness: 4.2e5, damping: 50}
+  upper: {upper: second, lower: first, stiffness: 4.2e5, damping: 50}
+sensors:
+  a0: {kind: acceleration, body: base, csv: a0, noise: 0.01}
+  a1: {kind: acceleration, body: first, csv: a1, noise: 0.01}
+  a2: {kind: acceleration, body: second, csv: a2, noise: 0.01}
+""")
+    assert np.all(identifiability(system) < 0.05)
+
+
 def test_identifiability_names_what_a_window_does_not_determine() -> None:
     std = identifiability(load_system())
     assert np.all(std < 0.05)

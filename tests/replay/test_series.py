@@ -190,6 +190,34 @@ def test_structures_and_matrices_of_matlab_have_names_as_in_matlab(tmp_path: Pat
     check(tmp_path / "a.mat", (x, f), TimeColumn("rig.t"))
 
 
+def _mat73_sheets(path: Path, sheets: FloatArray) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file["runs"] = sheets.transpose()  # axes backwards, as MATLAB writes them
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+SHEETS_OF = {
+    "a.mat": lambda path, sheets: scipy.io.savemat(path, {"runs": sheets}),
+    "b.mat": _mat73_sheets,
+    "a.npz": lambda path, sheets: np.savez(path, runs=sheets),
+    "a.json": lambda path, sheets: path.write_text(json.dumps({"runs": sheets.tolist()})),
+}
+
+
+@pytest.mark.parametrize("name", SHEETS_OF)
+def test_series_of_arrays_with_three_axes_are_addressed_by_column_and_sheet(tmp_path: Path, name: str) -> None:
+    sheets = np.stack([VALUES, 2 * VALUES, 3 * VALUES], axis=2)  # (500, 2, 3)
+    SHEETS_OF[name](tmp_path / name, sheets)
+    for sheet in (1, 3):
+        x, f = (Channel(c, "N", 1.0, column=f"runs(:,{i},{sheet})") for i, c in enumerate("xF", 1))
+        _, values, _ = read(tmp_path / name, (x, f), time=TimeColumn(rate=100.0))
+        np.testing.assert_array_equal(values, sheet * VALUES)
+    listing = signals_of(tmp_path / name)
+    assert [channel.column for channel, _ in listing.signals] == ["runs(:,1,1)", "runs(:,2,1)"]
+    assert "4 more series of further sheets are addressed alike: runs(:,1,2) to runs(:,2,3)" in listing.notes
+
+
 def test_json_rows_and_matrices(tmp_path: Path) -> None:
     rows = [
         {"time": t, "x": x, "F": f, "note": "n"} for t, (x, f) in zip(SECONDS.tolist(), VALUES.tolist(), strict=True)
