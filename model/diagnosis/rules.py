@@ -146,6 +146,9 @@ class ScreeningRules:
     lowest_mode: float = rule(1.0, "Hz; derived: below, an elastic mode is a rigid one of a train's body", 0.5, 2.0)
     highest_mode: float = rule(0.4, "of the sample rate; derived: there anti-alias filters cut", 0.3, 0.45)
     mode_damping: float = rule(0.01, "ratio of trial modes, and three times that; chosen: car bodies", 0.005, 0.02)
+    damped_lightly: float = rule(
+        0.05, "median damping ratio up to which modes may have their own; chosen: buildings, frames, wings", 0.03, 0.07
+    )
     mass_damping: float = rule(0.05, "the same of trial masses; chosen: equipment on rubber", 0.025, 0.1)
 
 

@@ -23,8 +23,8 @@ from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 
 # "bodies": two bodies, or a body and a support or the ground; "axle": both supports of one
-# "elements": all springs of a system together
-Where = Literal["element", "elements", "pair", "body", "bodies", "sensor", "support", "axle"]
+# "elements": all springs of a system together; "bodies": two of them; "every body": all together
+Where = Literal["element", "elements", "pair", "body", "bodies", "every body", "sensor", "support", "axle"]
 Channels = Literal["sensor", "support", "force"]
 EXTENSION, COMPRESSION = "extension", "compression"  # forms of a law that acts in this direction alone
 Values = Sequence[Any]  # one float or array per parameter, in the law's order; they broadcast with the motion
@@ -296,7 +296,7 @@ class StructureLaw(Parametrised):
     name: str
     title: str
     parameters: tuple[ParameterSpec, ...]
-    where: Where  # "body", "bodies" or "element"
+    where: Where  # "body", "bodies", "every body", "element" or "elements"
     # The mechanics with the law, of the sites that its location names; `variant` as in a term
     modify: Callable[[Mechanics, tuple[Foothold, ...], Values, str], Mechanics]
     absent: tuple[float, ...]
@@ -315,6 +315,11 @@ class StructureLaw(Parametrised):
     branches: Callable[[Values, SpringDamper], tuple[Maxwell, ...]] | None = None
     prior_cost: float = 0.0
     fault: bool = False
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether its one value holds for all springs, or all bodies, of a system."""
+        return self.where in ("elements", "every body")
 
 
 @dataclass(frozen=True)

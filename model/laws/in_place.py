@@ -78,8 +78,8 @@ def all_in_place(file: SystemFile, mechanics: Mechanics, laws: Sequence[PlacedLa
         if is_linear(placed):
             before = len(mechanics.stiffness)
             mechanics = put_in_place(file, mechanics, placed)
-            if len(mechanics.stiffness) > before:
-                added.append(f"{placed.location}.{placed.law.name}")
+            name, count = f"{placed.location}.{placed.law.name}", len(mechanics.stiffness) - before
+            added += [name] if count == 1 else [f"{name}.{number}" for number in range(1, count + 1)]
             found += _followers(file, placed, len(mechanics.stiffness) - 1)
     return MechanicsWithLaws(mechanics, tuple(added), tuple(found))
 

@@ -29,7 +29,7 @@ class PlacedLaw:
 
     @property
     def places(self) -> tuple[str, ...]:
-        """The one or two names of the location."""
+        """The names of the location."""
         return tuple(self.location.split("|"))
 
     @property
@@ -120,7 +120,7 @@ def _law_of(
     fitting = [
         law
         for law in catalogue
-        if isinstance(law, kinds) and not (isinstance(law, StructureLaw) and (law.where == "element") != of_element)
+        if isinstance(law, kinds) and not (isinstance(law, StructureLaw) and not _belongs(law, of_element=of_element))
     ]
     for law in fitting:
         if law.name == effect:
@@ -129,6 +129,11 @@ def _law_of(
         raise ValueError("this law does not belong here")
     known = [law.name for law in fitting]
     raise ValueError(f"no such law; known here are {', '.join(known)}{did_you_mean(effect, known)}")
+
+
+def _belongs(law: StructureLaw, *, of_element: bool) -> bool:
+    """Whether a structural law may stand at an element, or at a body; those of all springs stand nowhere."""
+    return law.where == "element" if of_element else law.where in ("body", "bodies", "every body")
 
 
 def _formula_of(texts: Mapping[str, str], names: tuple[str, ...]) -> ElementLaw:
@@ -171,6 +176,9 @@ def _values(law: Law, numbers: Mapping[str, LawValue]) -> list[LawValue]:
         raise ValueError(
             f"{name} is no parameter of it; it has {', '.join(law.names) or 'none'}{did_you_mean(name, law.names)}"
         )
+    if isinstance(law, StructureLaw) and law.everywhere:  # what is not named is absent
+        absent = zip(law.names, law.absent, strict=True)
+        numbers = {name: LawValue(value=value, fixed=True) for name, value in absent} | {**numbers}
     for name in law.names:
         if name not in numbers:
             raise ValueError(f"{name} is missing")
@@ -191,7 +199,9 @@ def _check_force(law: ElementLaw, values: tuple[float, ...], element: Element) -
 
 
 def _location(file: SystemFile, law: Law, location: str, partner: str | None) -> str:
-    """The place with its partner, for laws that act between two."""
+    """The place with its partner, for laws that act between two; all bodies of one that acts at all."""
+    if isinstance(law, StructureLaw) and law.where == "every body" and partner is None:
+        return "|".join(file.bodies)
     where = "body" if isinstance(law, BodyLaw) else law.where
     if where not in ("pair", "axle", "bodies"):
         if partner is not None:

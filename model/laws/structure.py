@@ -158,6 +158,57 @@ WRONG_POSITION = StructureLaw(
 )
 
 
+def frame_of(mechanics: Mechanics) -> FloatArray:
+    """What the bodies move relative to, as displacements of the supports (supports,): the ground, thus zeros; a single
+    support where nothing else holds them."""
+    supports = mechanics.G.shape[1]
+    heave = np.array([dof.endswith(".z") for dof in mechanics.dofs], dtype=float)
+    alone = supports == 1 and np.allclose(mechanics.H @ heave + mechanics.G[:, 0], 0.0)
+    return np.ones(1) if alone else np.zeros(supports)
+
+
+MOST_MODES = 12  # the slowest, that have a damping ratio of their own
+_ELASTIC = 2 * np.pi * 1e-3  # rad/s; what is slower moves as a whole
+
+
+def elastic_modes(mechanics: Mechanics) -> tuple[FloatArray, FloatArray]:
+    """Natural frequencies (rad/s, (m,)) and shapes (n, m), of modal mass 1, of the slowest elastic modes."""
+    root = np.sqrt(mechanics.mass)
+    squares, vectors = np.linalg.eigh((mechanics.H.T * mechanics.stiffness) @ mechanics.H / np.outer(root, root))
+    elastic = np.flatnonzero(squares > _ELASTIC**2)[:MOST_MODES]
+    return np.sqrt(squares[elastic]), vectors[:, elastic] / root[:, None]
+
+
+def _damped_by_mode(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
+    """One damper per mode, along its modal coordinate: C = M (sum 2 zeta omega phi phi^T) M."""
+    frame, found = frame_of(mechanics), mechanics
+    heave = np.array([dof.endswith(".z") for dof in mechanics.dofs], dtype=float)
+    omegas, shapes = elastic_modes(mechanics)
+    for ratio, omega, shape in zip(p, omegas, shapes.T, strict=False):
+        if ratio > 0:
+            row = mechanics.mass * shape
+            found = with_element(found, row, 0.0, 2 * float(ratio) * float(omega), -(row @ heave) * frame)
+    return found
+
+
+MODAL_DAMPING = StructureLaw(
+    name="modal_damping",
+    title="damping of the modes, not of dampers between the bodies",
+    parameters=tuple(
+        ParameterSpec(f"mode_{number}", "1", 0.0, 0.5, "damping ratio of an elastic mode, by rising frequency", _any)
+        for number in range(1, MOST_MODES + 1)
+    ),
+    where="every body",
+    modify=_damped_by_mode,
+    absent=(0.0,) * MOST_MODES,
+    looks_like="every resonance is damped on its own, as no set of dampers between the bodies would damp them",
+    confused_with=("structural_damping", "missing_connection"),
+    sentence="damped mode by mode, by {all} of critical damping beside the dampers between them",
+    strengths=tuple(range(MOST_MODES)),
+    prior_cost=RARE,
+)
+
+
 _RIGID = 1000.0  # Hz, of an inerter on what holds it, above all that is compared
 
 

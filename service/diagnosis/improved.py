@@ -12,7 +12,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from sprung.model.diagnosis.report.report import IdentifiedLaw, Report, ReportedParameter
 from sprung.model.diagnosis.response.terms import WIDER
-from sprung.model.laws import CATALOGUE, ElementLaw, SensorLaw, StructureLaw
+from sprung.model.laws import CATALOGUE, ElementLaw, Law, SensorLaw, StructureLaw
 from sprung.model.system import System, parse_system
 
 _DIGITS = 6
@@ -121,10 +121,11 @@ def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> Non
     if entry is None:
         return
     setting = CommentedMap({name: text for name in ("formula", "memory") if (text := getattr(law, name))})
-    setting.update(_law_values(system, law, held))
+    known = next((one for one in system.catalogue if one.name == law.effect), None)
+    setting.update(_law_values(known, law, held))
     if law.variant and law.variant != WIDER:
         setting["variant"] = law.variant
-    if others:
+    if others and not (isinstance(known, StructureLaw) and known.everywhere):
         setting["with"] = others[0]
     setting.fa.set_flow_style()
     placed = CommentedMap({law.effect: setting})
@@ -132,12 +133,13 @@ def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> Non
     entry.setdefault("laws", CommentedSeq()).append(placed)
 
 
-def _law_values(system: System, law: IdentifiedLaw, held: set[str]) -> dict[str, CommentedMap]:
+def _law_values(known: Law | None, law: IdentifiedLaw, held: set[str]) -> dict[str, CommentedMap]:
     """The values of a law's parameters as the file has them: with deviation, and whether they are fixed."""
-    known = next((one for one in system.catalogue if one.name == law.effect), None)
     corner = known.corner if isinstance(known, ElementLaw) else None
     values = {}
     for index, parameter in enumerate(law.parameters):
+        if isinstance(known, StructureLaw) and known.everywhere and parameter.value == parameter.std == 0:
+            continue  # a mode that the system does not have
         value = CommentedMap(value=_rounded(parameter.value))
         if parameter.std > 0:
             value["std"] = float(f"{parameter.std:.3g}")

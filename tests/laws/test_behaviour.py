@@ -94,7 +94,7 @@ def test_laws_that_contain_commoner_ones_must_beat_them() -> None:
     assert rare == {
         *("air_spring", "fractional_stiffness", "anti_roll_bar", "wheel_flat", "rail_joints"),
         *("stribeck", "dahl", "lugre", "pinched_hysteresis", "friction_backlash", "gas_spring", "progressive_stop"),
-        *("missing_connection", "suspended_mass", "structural_damping", "inerter"),
+        *("missing_connection", "suspended_mass", "structural_damping", "modal_damping", "inerter"),
     }
 
 

@@ -140,7 +140,7 @@ def test_words_are_complete_and_look_alikes_exist(law: Law) -> None:
     names = {other.name for other in CATALOGUE} | {"unknown"}
     assert law.looks_like and law.title
     assert set(law.confused_with) <= names - {law.name}
-    law.sentence.format(**{name: "1 N" for name in law.names})
+    law.sentence.format(**{name: "1 N" for name in (*law.names, "all")})
     assert len(law.absent) == len(law.parameters)
     for parameter in law.parameters:
         assert parameter.low < parameter.high and parameter.unit and parameter.meaning

@@ -121,10 +121,11 @@ def changed_parts(state: Investigation) -> int:
 def is_part(law: Law) -> bool:
     """Whether a law is a linear structural part: a connection, suspended mass, series spring, rubber.
 
-    Wrong values of the file are none.  Sums of such parts approximate any other structure.
+    Wrong values of the file are none, nor is damping of all springs or bodies.  Sums of such parts approximate any
+    other structure.
     """
     if isinstance(law, StructureLaw):
-        return not law.holds
+        return not law.holds and not law.everywhere
     return isinstance(law, ElementLaw) and law.memory_decay is not None
 
 

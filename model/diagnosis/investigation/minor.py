@@ -70,7 +70,7 @@ def is_minor(state: Investigation, trial: Trial) -> bool:
     if _absorbed(state, trial):
         return True
     rules = state.options.rules.acceptance
-    even = (found.trial.gain for found in state.found if _of_all_springs(found.trial.term.law))
+    even = (found.trial.gain for found in state.found if _is_everywhere(found.trial.term.law))
     if is_part(trial.term.law) and trial.gain < rules.minor_beside * max(even, default=0.0):
         return True  # material damping varies over frequency more than its law
     for index, found in enumerate(state.found):
@@ -103,8 +103,8 @@ def _is_minor_beside(state: Investigation, index: int, trial: Trial) -> bool:
     return alone and trial.reduction < rules.minor_beside * first and not _explains_most_of_the_rest(state, trial)
 
 
-def _of_all_springs(law: Law) -> bool:
-    return isinstance(law, StructureLaw) and law.branches is not None
+def _is_everywhere(law: Law) -> bool:
+    return isinstance(law, StructureLaw) and law.everywhere
 
 
 def _explains_most_of_the_rest(state: Investigation, trial: Trial) -> bool:

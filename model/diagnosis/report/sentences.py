@@ -13,6 +13,7 @@ from sprung.model.laws import StructureLaw
 
 def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
     values = {p.name: p.words() for p in finding.parameters}
+    values["all"] = ", ".join(values.values())
     try:
         words = _formula_in_words(finding) if finding.formula else term.law.sentence.format(**values)
     except (KeyError, IndexError):

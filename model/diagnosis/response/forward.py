@@ -29,6 +29,15 @@ from sprung.model.system import System
 def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Structure:
     """Structure for log-ratios `theta` (P,) of the system's parameters, with laws of bodies and structure."""
     mechanics = system.mechanics
+    mass, stiffness, damping = mechanics.mass.copy(), mechanics.stiffness.copy(), mechanics.damping.copy()
+    for parameter, log_ratio in zip(system.parameters, theta, strict=True):
+        ratio = np.exp(log_ratio)
+        if parameter.quantity == "mass":
+            mass[mechanics.body_of_dof == system.bodies.index(parameter.element)] *= ratio
+        else:
+            values = stiffness if parameter.quantity == "stiffness" else damping
+            values[system.elements.index(parameter.element)] *= ratio
+    mechanics = replace(mechanics, mass=mass, stiffness=stiffness, damping=damping)
     for term in terms:
         if isinstance(term.law, BodyLaw) and term.law.load is None:
             body = system.bodies.index(term.location)
@@ -36,17 +45,7 @@ def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: 
         elif isinstance(term.law, StructureLaw):
             sites = sites_of(system.file, term.location)
             mechanics = term.law.modify(mechanics, sites, term.parameters, term.variant)
-    structure = Structure.nominal(mechanics, sensors)
-    stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
-    mass = structure.mass.copy()
-    for parameter, log_ratio in zip(system.parameters, theta, strict=True):
-        ratio = np.exp(log_ratio)
-        if parameter.quantity == "mass":
-            mass[structure.body_of_dof == system.bodies.index(parameter.element)] *= ratio
-        else:
-            values = stiffness if parameter.quantity == "stiffness" else damping
-            values[system.elements.index(parameter.element)] *= ratio
-    return replace(structure, stiffness=stiffness, damping=damping, mass=mass)
+    return Structure.nominal(mechanics, sensors)
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import nnls
 from scipy.special import chdtrc
 
 from sprung.model.diagnosis.fit.optimise import Fit
@@ -170,6 +171,21 @@ class Projector:
         left = max(left, least * size) + more[1]
         product = float(column @ self.residual) + more[0]
         return product**2 / left, product / left
+
+    def nonnegative(self, columns: FloatArray) -> tuple[float, FloatArray]:
+        """Statistic and amplitudes (m,) of several columns (R, m) together, no amplitude negative."""
+        inside = self.q.T @ columns
+        size = np.sum(columns**2, axis=0)
+        left = columns.T @ columns - inside.T @ inside
+        amounts = np.zeros(columns.shape[1])
+        seen = np.flatnonzero(np.diag(left) > _ROUNDING * size)
+        scale = 1 / np.sqrt(np.diag(left)[seen])
+        values, vectors = np.linalg.eigh(left[np.ix_(seen, seen)] * np.outer(scale, scale))
+        root = np.sqrt(np.maximum(values, 1e-9))
+        product = scale * (columns[:, seen].T @ self.residual)
+        if len(seen):
+            amounts[seen] = scale * nnls((vectors * root).T, vectors.T @ product / root)[0]
+        return float(amounts[seen] @ (product / scale)), amounts
 
 
 class ScalarResponse:

@@ -20,7 +20,8 @@ from sprung.model.diagnosis.rules import ScreeningRules
 from sprung.model.diagnosis.screening.families import PART, STRUCTURE
 from sprung.model.diagnosis.screening.score import Candidate, Projector
 from sprung.model.laws import Law, StructureLaw
-from sprung.model.laws.structure import AXES, moved_row, point_rows, sites_of
+from sprung.model.laws.structure import AXES, elastic_modes, frame_of, moved_row, point_rows, sites_of
+from sprung.model.mechanics import Mechanics
 from sprung.model.schema import GROUND, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -40,6 +41,8 @@ def structure_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterato
         if law.where == "bodies":
             for one, other in unconnected(system):
                 yield _connection(projector, law, one, other)
+        elif law.where == "every body":
+            yield from _of_all_bodies(projector, law)
         elif law.where == "body":
             for name in system.bodies:
                 yield _suspended(projector, law, name)
@@ -75,6 +78,45 @@ def _of_all_springs(projector: Projector, law: StructureLaw) -> Iterator[tuple[C
     if springs and amount > 0:
         amount = min(_FAINT * amount, law.parameters[0].high)
         yield Candidate(replace(term, parameters=(amount, *law.absent[1:]), scales=(amount, 0.1)), score, STRUCTURE), 1
+
+
+def _of_all_bodies(projector: Projector, law: StructureLaw) -> Iterator[tuple[Candidate, int]]:
+    """Damping ratios of all elastic modes together, where most are lightly damped."""
+    system, fit, band = projector.problem.system, projector.fit, projector.grid.band
+    structure = fit.forward.plant.structure
+    n = system.mechanics.n
+    mechanics = replace(
+        system.mechanics,
+        mass=structure.mass[:n],
+        stiffness=structure.stiffness[: len(system.elements)],
+        damping=structure.damping[: len(system.elements)],
+    )
+    omegas, shapes = elastic_modes(mechanics)
+    if not len(omegas) or not _lightly_damped(mechanics, omegas, shapes, projector.problem.rules.screening):
+        return
+    velocity = fit.motions.velocity[band][:, :n].copy()
+    heave = np.array([dof.endswith(".z") for dof in mechanics.dofs])
+    for support in np.flatnonzero(frame_of(mechanics)):
+        velocity[:, heave] -= _support_motion(projector, int(support))[1][:, None]
+    rows = (mechanics.mass[:, None] * shapes).T
+    columns = []
+    for row, omega in zip(rows, omegas, strict=True):
+        force = -2 * omega * (velocity @ row)
+        columns.append(projector.pack((projector.of_load[:, :, :n] @ row) * force[:, None]))
+    score, ratios = projector.nonnegative(np.stack(columns, axis=1))
+    values = np.zeros(len(law.parameters))
+    values[: len(omegas)] = np.minimum(ratios, [spec.high for spec in law.parameters[: len(omegas)]])
+    fixed = tuple(index >= len(omegas) for index in range(len(values)))
+    scales = (0.01,) * len(values)
+    term = Term(law, "|".join(system.bodies), tuple(map(float, values)), scales=scales, fixed=fixed)
+    yield Candidate(term, score, STRUCTURE), 1
+
+
+def _lightly_damped(mechanics: Mechanics, omegas: FloatArray, shapes: FloatArray, rules: ScreeningRules) -> bool:
+    """Whether most elastic modes are damped too little to be those of bodies on dampers."""
+    C = (mechanics.H.T * mechanics.damping) @ mechanics.H
+    ratios = np.einsum("nm,nk,km->m", shapes, C, shapes) / (2 * omegas)
+    return bool(np.median(ratios) < rules.damped_lightly)
 
 
 def _beside(projector: Projector, law: StructureLaw, along: int, name: str) -> Candidate:
