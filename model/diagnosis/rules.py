@@ -220,6 +220,12 @@ class PlausibleRules:
     masses: float = rule(
         0.3, "of a body's mass, deviation of the prior beyond that; chosen: undetermined ones stay near", 0.1, 1.0
     )
+    faulty: float = rule(
+        10.0,
+        "data sheets' deviations, the prior's of an instrument beyond; chosen: large faults are kept",
+        5.0,
+        20.0,
+    )
     slow_mode: float = rule(
         0.5, "times the slowest mode on springs, below which no body bends; chosen: it is lighter", 0.3, 0.8
     )

@@ -14,10 +14,10 @@ instruments of one rig are comparable.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import stdtr
+from scipy.special import ndtr, stdtr
 
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
@@ -89,28 +89,65 @@ def _in_deviations(state: Investigation, term: Term) -> float:
     return abs(term.parameters[0] - term.law.absent[0]) / spread if spread > 0 else np.inf
 
 
-def is_outlier(terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:
+@dataclass(frozen=True)
+class _Deviation:
+    """An error in standard deviations of its data sheet, and the standard deviation of its estimate, likewise."""
+
+    off: float
+    std: float
+
+    def visible(self, among: int, by_chance: float) -> float:
+        """Its size; 0 where the largest of so many that are none would be as large by chance."""
+        return abs(self.off) if 2 * ndtr(-abs(self.off) / max(self.std, 1e-300)) * among < by_chance else 0.0
+
+
+def is_outlier(fit: Fit, terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:
     """Whether an error is larger than all others, and an outlier of its kind by Student's t-test.
 
-    Errors are in standard deviations of the data sheets, relative to the median of their kind, which all may share.
+    terms: errors in the fit, perhaps without what they share; taken relative to the median of their kind.  How far the
+    others scatter beyond their standard deviations is estimated by moments (DerSimonian and Laird 1986).
     """
     place, effect, _ = key  # the form of a lag is hardly identifiable
-    kinds, away = {term.law.name for term in terms}, dict[tuple[str, str], float]()
-    for kind in kinds:
-        of_kind = {term.location: _relative_deviation(term) for term in terms if term.law.name == kind}
-        middle = float(np.median(list(of_kind.values())))
-        away |= {(location, kind): off - middle for location, off in of_kind.items()}
+    away = _relative_deviations(fit, terms)
     own = away.pop((place, effect), None)
-    others = np.array([off for (_, kind), off in away.items() if kind == effect])
-    if own is None or len(others) < 2 or abs(own) <= rules.alone * max(map(abs, away.values())):
+    others = [one for (_, kind), one in away.items() if kind == effect]
+    if own is None or len(others) < 2:
         return False
-    spread = float(np.std(others, ddof=1)) * np.sqrt(1 + 1 / len(others))
-    distance = abs(own - float(np.mean(others))) / max(spread, 1e-300)
+    if abs(own.off) <= rules.alone * max(one.visible(len(away), rules.by_chance) for one in away.values()):
+        return False
+    middle, spread = _scatter(others)
+    distance = abs(own.off - middle) / float(np.hypot(spread, own.std))
     return bool(2 * stdtr(len(others) - 1, -distance) * (len(others) + 1) < rules.by_chance)
 
 
-def _relative_deviation(term: Term) -> float:
-    return (term.parameters[0] - term.law.absent[0]) / term.scales[0]
+def _relative_deviations(fit: Fit, terms: Sequence[Term]) -> dict[tuple[str, str], _Deviation]:
+    """Errors by place and kind, relative to the median of their kind."""
+    at = {term.key: index for index, term in enumerate(fit.point.terms)}
+    away: dict[tuple[str, str], _Deviation] = {}
+    for kind in {term.law.name for term in terms}:
+        alike = [term for term in terms if term.law.name == kind]
+        sheet = np.array([term.scales[0] for term in alike])
+        off = np.array([term.parameters[0] - term.law.absent[0] for term in alike]) / sheet
+        places = [fit.place(at[term.key]).start for term in alike]
+        apart = np.eye(len(alike)) - 1 / len(alike)  # what all share is less certain than how they differ
+        covariance = apart @ (fit.covariance[np.ix_(places, places)] / np.outer(sheet, sheet)) @ apart
+        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        away |= {
+            (term.location, kind): _Deviation(float(value), float(s))
+            for term, value, s in zip(alike, off - np.median(off), std, strict=True)
+        }
+    return away
+
+
+def _scatter(errors: Sequence[_Deviation]) -> tuple[float, float]:
+    """Mean of errors, and the standard deviation of one more of them, exactly known, about it."""
+    off, variance = np.array([one.off for one in errors]), np.array([max(one.std, 1e-12) ** 2 for one in errors])
+    weight = 1 / variance
+    mean = float(weight @ off / np.sum(weight))
+    excess = float(weight @ (off - mean) ** 2) - (len(errors) - 1)
+    between = max(0.0, excess / float(np.sum(weight) - np.sum(weight**2) / np.sum(weight)))
+    weight = 1 / (variance + between)
+    return float(weight @ off / np.sum(weight)), float(np.sqrt(between + 1 / np.sum(weight)))
 
 
 def is_gain(term: Term) -> bool:
@@ -144,8 +181,7 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     """The investigation with the calibration errors of all channels and bodies in its model, its search begun anew.
 
     first: the first that was found; if it is an outlier, it is a fault, and the model is not changed.
-    Errors of instruments beyond the tolerance beside the findings so far are left out, to be found as faults.  Gains of
-    the inputs are kept fixed from now on: their common part is only identifiable from the curvature of a law.
+    Gains of the inputs are kept fixed from now on: their common part is only identifiable from the curvature of a law.
     """
     file, terms = state.fit.point.terms[: state.given], calibration_terms(state)
     keys = {term.key for term in terms}
@@ -155,7 +191,7 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
         if fit is None:
             return replace(state, calibrations=0)
         fitted = centred(fit.point.terms[len(file) : len(file) + len(terms)])
-        if is_outlier(fitted, first.key, state.options.rules.plausible):
+        if is_outlier(fit, fitted, first.key, state.options.rules.plausible):
             return replace(state, calibrations=0)
         terms = tuple(_freed_beyond_tolerance(state, fitted))
         if terms == fitted:
@@ -176,12 +212,16 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
 
 
 def _freed_beyond_tolerance(state: Investigation, terms: Sequence[Term]) -> Iterator[Term]:
-    """Terms within tolerance, and masses beyond with a wide prior; other errors beyond are to be found as faults."""
+    """Terms with their tolerance as a prior, those beyond it with a wide one.
+
+    Without any, an instrument that is off would be held exact, and all others would follow it.
+    """
+    rules = state.options.rules.plausible
     for term in terms:
         if within_data_sheet(state, term):
             yield term
-        elif term.law is MASS_CHANGE:
-            yield replace(term, known=(state.options.rules.plausible.masses,))
+        else:
+            yield replace(term, known=(rules.masses if term.law is MASS_CHANGE else rules.faulty * term.scales[0],))
 
 
 def with_free_gains(state: Investigation, fit: Fit) -> Fit:
