@@ -169,14 +169,15 @@ def _add_terms(
     """Columns of the terms' parameters, without the reaction of the laws.
 
     Another mass gets its column in the same way as an estimated one: what masses, stiffnesses and dampings together
-    leave unchanged is not determined, however approximate the reaction of the laws is.
+    leave unchanged is not determined, however approximate the reaction of the laws is.  Beside an unmeasured force all
+    columns are taken along the smoothed motion, since the residual's covariance changes with the response, too.
     """
     at = P = len(point.theta)
-    measured = forward.with_part(problem.part)
+    pushed = forward if problem.process_noise else forward.with_part(problem.part)
     for index, term in enumerate(point.terms):
         for j in range(len(term.parameters)):
             if forward.faulty_force(term) is not None:
-                known.loads[at] = measured.fault_load(term)
+                known.loads[at] = pushed.fault_load(term)
                 known.packed.add_load(at, known.loads[at])
                 if problem.process_noise:
                     change = forward.inputs_by_force_fault(term)[forward.part.grid.band]
@@ -269,9 +270,9 @@ def _difference(
     else:
         other, other_forward, other_forces = problem.predict(elsewhere, working.inputs, forward.plant)
     free = (problem.free_columns(other_forward) - problem.free_columns(forward)) @ point.state
-    change = (other - shown + free) / step
     if not problem.process_noise:
-        return Change(change)
+        return Change((other - shown + free) / step)
+    change = (problem.smoothed(other_forward, other) - problem.smoothed(forward, shown) + free) / step
     log_det = (Whitener.of(other_forward, problem.noise).log_det - working.whitener.log_det) / step
     if forces is None or other_forces is None:
         return Change(change, log_det)

@@ -92,7 +92,10 @@ class Problem:
 
     def shown_of_smoothed(self, forward: Forward, spectrum: ComplexArray) -> ComplexArray:
         """Shown sensor signals of the smoothed motion, (F, S), from the residual (F, S) under the measured inputs."""
-        shown = self.part.sensors - spectrum
+        return self.smoothed(forward, self.part.sensors - spectrum)
+
+    def smoothed(self, forward: Forward, shown: ComplexArray) -> ComplexArray:
+        """Shown sensor signals under the smoothed inputs, (F, S), from those under the measured inputs."""
         if forward.part is self.part:
             return shown
         return shown - self._of_input_noise(forward) * forward.sensor_factor

@@ -36,6 +36,8 @@ from sprung.model.schema import SupportInput
 from sprung.model.system import System
 
 _STEPS = 12  # of a fit of the structure with the calibration
+_PASSES = 3  # of such fits, with those beyond their tolerance freed after each
+_TAILS, _REWEIGHTED = 4.0, 50  # degrees of freedom of Student's t, and iterations
 
 
 def expected(system: System, signals: Signals, law: Law, location: str, rules: PlausibleRules) -> float:
@@ -186,15 +188,19 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     file, terms = state.fit.point.terms[: state.given], calibration_terms(state)
     keys = {term.key for term in terms}
     found = tuple(term for term in state.fit.point.terms[state.given :] if term.key not in keys)
-    for _ in range(2):
-        fit = try_optimise(state.problem, replace(state.fit.point, terms=(*file, *terms, *found)), _STEPS)
+    problem = state.problem
+    for _ in range(_PASSES):
+        fit = try_optimise(problem, replace(state.fit.point, terms=(*file, *terms, *found)), _STEPS)
         if fit is None:
             return replace(state, calibrations=0)
-        fitted = centred(fit.point.terms[len(file) : len(file) + len(terms)])
+        if problem.process_noise:  # beside a strong unmeasured force, which they make up for, values are rough
+            problem, fit = refreshed(problem, fit)
+        fitted = _with_heavy_tails(fit, range(len(file), len(file) + len(terms)))
+        fitted = fitted if _anchored(state, fitted) else centred(fitted)
         if is_outlier(fit, fitted, first.key, state.options.rules.plausible):
             return replace(state, calibrations=0)
         terms = tuple(_freed_beyond_tolerance(state, fitted))
-        if terms == fitted:
+        if [term.known for term in terms] == [term.known for term in fitted]:
             break
     held = tuple(replace(term, fixed=(True,)) for term in terms)  # else they absorb part of the missing law
     problem = replace(state.problem, noise=state.base.noise)
@@ -208,20 +214,56 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     if float(np.max(misfit(base))) > state.options.rules.setup.misfit:
         return begun  # fixed until the missing law is found: before, they would diverge
     base = with_free_gains(begun, base)
-    return replace(begun, base=base, fit=base)
+    if not problem.process_noise:
+        return replace(begun, base=base, fit=base)
+    # values found beside a strong unmeasured force are rough, and kept so they would keep it strong
+    problem, base = refreshed(problem, base)
+    screening = screen(problem, base, state.problem.system.catalogue, state.options.project)
+    begun = replace(begun, problem=problem, base=base, fit=base, first=screening, last=screening)
+    return replace(begun, held=replace(state.held, noise=problem.noise))
+
+
+def _with_heavy_tails(fit: Fit, indices: range) -> tuple[Term, ...]:
+    """Errors in a fit, with Student's t in place of their Gaussian priors where nothing but these determines them.
+
+    Factors that masses, gains and springs have in common change nothing that is measured; along them, one large error
+    would pull all others.  Iteratively reweighted least squares (Holland and Welsch 1977).
+    """
+    terms = [fit.point.terms[index] for index in indices]
+    places = [fit.place(index).start for index in indices]
+    sheet, prior = np.array([(term.scales[0], term.known[0]) for term in terms]).T
+    covariance = fit.covariance[np.ix_(places, places)] / np.outer(sheet, sheet)
+    measured, directions = np.linalg.eigh(np.linalg.pinv(covariance, hermitian=True) - np.diag((sheet / prior) ** 2))
+    free = directions[:, measured < 1]  # less is known than from the data sheets
+    fitted = np.array([term.parameters[0] - term.law.absent[0] for term in terms]) / sheet
+    found = fitted
+    for _ in range(_REWEIGHTED if free.size else 0):
+        weighted = free * ((_TAILS + 1) / (_TAILS + found**2))[:, None]
+        found = fitted - free @ np.linalg.solve(weighted.T @ free, weighted.T @ fitted)
+    values = zip(terms, found * sheet, strict=True)
+    return tuple(replace(term, parameters=(float(term.law.absent[0] + value),)) for term, value in values)
+
+
+def _anchored(state: Investigation, terms: Sequence[Term]) -> bool:
+    """Whether a measured force, held exact, determines the gains that others have in common."""
+    free = {term.location for term in terms if is_gain(term)}
+    return any(name not in free for name in state.signals.force_names)
 
 
 def _freed_beyond_tolerance(state: Investigation, terms: Sequence[Term]) -> Iterator[Term]:
-    """Terms with their tolerance as a prior, those beyond it with a wide one.
+    """Terms with their tolerance as a prior, sensors and masses beyond it with a wide one.
 
-    Without any, an instrument that is off would be held exact, and all others would follow it.
+    Without any, a sensor that is off would be held exact, and all others would follow it.  Inputs beyond are left out,
+    to be found as faults: their values are kept from now on, and may make up for a law that is still missing.
     """
-    rules = state.options.rules.plausible
+    rules, sensors = state.options.rules.plausible, state.signals.sensor_names
     for term in terms:
         if within_data_sheet(state, term):
             yield term
-        else:
-            yield replace(term, known=(rules.masses if term.law is MASS_CHANGE else rules.faulty * term.scales[0],))
+        elif term.law is MASS_CHANGE:
+            yield replace(term, known=(rules.masses,))
+        elif term.location in sensors:
+            yield replace(term, known=(rules.faulty * term.scales[0],))
 
 
 def with_free_gains(state: Investigation, fit: Fit) -> Fit:
