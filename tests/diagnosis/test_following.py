@@ -10,7 +10,7 @@ from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.system import parse_system
 from tests.diagnosis_cases import DAMPING, FINE, simulate
 
-SLOPE, BEGIN, CALLS = -0.015, 0.3, 5  # 1/K; s that the filter takes from the start; of the law in one step
+SLOPE, BEGIN, CALLS = -0.015, 0.3, 4  # 1/K; s that the filter takes from the start; of the law in one step
 
 
 def oil(t: np.ndarray | float) -> np.ndarray | float:

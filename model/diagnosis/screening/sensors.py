@@ -81,6 +81,7 @@ def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Ca
     part, band = problem.part, grid.band
     names = [n for n, s in problem.system.file.inputs.items() if s.kind == "force"]
     plant = fit.forward.plant
+    pushed = fit.forward.part if problem.process_noise else part  # as in a fit's columns
     for i, name in enumerate(names):
         if not np.any(part.force[:, i]):
             continue  # zero throughout: nobody measured it
@@ -91,7 +92,7 @@ def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Ca
         steady = plant.polynomial_sensors(q, np.zeros_like(part.support_polynomial))
         spectrum = (grid.monomial_spectra @ steady)[band] * fit.forward.sensor_factor[band]
         of_offset = (projector.factor @ spectrum[:, :, None])[:, :, 0]
-        of_gain = -(projector.of_load @ direction) * part.force[band, i, None]
+        of_gain = -(projector.of_load @ direction) * pushed.force[band, i, None]
         for law in laws:
             slope = law.slope()
             column = projector.pack(slope.gain * of_gain + slope.offset * of_offset)

@@ -57,11 +57,13 @@ def test_a_formula_is_written_into_the_system_file_and_read_again(told: Report) 
 
 
 @pytest.mark.slow
-def test_a_stop_of_one_side_is_a_formula_and_no_bump_stop() -> None:
+def test_a_stop_of_one_side_is_named_with_its_side() -> None:
     record = simulate(lambda d, v: -1.5e6 * max(-d - 0.002, 0.0), seconds=30.0, seed=3)
-    (finding,) = diagnose(quarter_car(), record, Options()).findings
-    assert finding.formula == "a * max(-d - L, 0)"
-    assert [p.value for p in finding.parameters] == pytest.approx([-1.5e6, 0.002], rel=0.01)
+    report = diagnose(quarter_car(), record, Options())
+    (finding,) = report.findings
+    assert (finding.location, finding.effect) == ("secondary", "bump_stop")
+    assert [p.value for p in finding.parameters] == pytest.approx([0.002, 1.5e6], rel=0.01)
+    assert "of compression" in report.summary
 
 
 @pytest.mark.slow

@@ -89,5 +89,5 @@ def test_a_sum_is_reported_with_its_force_and_its_half_is_doubted(unnamed: tuple
     (alone,) = compete(
         state.problem, state.fit, [Candidate(Term(half, "secondary", (RATE,), scales=(RATE,)), 1.0, ELEMENT)]
     )
-    assert "follows the element's motion" in doubt_of(state.problem, alone, [alone])
+    assert "depends on the element's motion" in doubt_of(state.problem, alone, [alone])
     assert np.std(whole_force(told.fit) - whole_force(alone.fit, told.fit)) > 0.1 * size
