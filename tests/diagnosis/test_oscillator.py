@@ -15,6 +15,8 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import along_measured_motion
 from sprung.model.diagnosis.record.signals import Signals, declared_noise, transform
 from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import find_law
 from sprung.model.system import parse_system
 from tests.diagnosis_cases import MadeRecord
 
@@ -120,7 +122,31 @@ def test_slopes_of_the_log_determinant_agree_with_finite_differences(linear: Mad
         assert slopes[i] == pytest.approx((up - down) / 2e-4, rel=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("effect", "place", "within"),
+    [("sensor_gain", "position", 1e-3), ("sensor_gain", "shaker", 1e-3), ("mass_change", "mass", 0.05)],
+)
+def test_gradients_by_gains_and_masses_beside_an_unmeasured_force_agree_with_finite_differences(
+    linear: MadeRecord, effect: str, place: str, within: float
+) -> None:
+    """The residual's covariance depends on them, too: else they would be pulled from their values."""
+    system, signals = parse_system(SYSTEM), signals_of(linear)
+    noise = replace(declared_noise(system, signals), force=np.array([2.0]))
+    problem = Problem(system, transform(signals, noise), signals.sensor_index, noise)
+
+    def at(value: float) -> Linearised:
+        term = Term(find_law(effect), place, (value,), scales=(0.01,))
+        return linearise(problem, *along_measured_motion(problem, Point(np.array([0.1, -0.1]), (term,), np.zeros(2))))
+
+    def objective(lin: Linearised) -> float:
+        return float(lin.residual @ lin.residual + lin.log_det)
+
+    here = at(1.03)
+    slope = float(here.log_det_slope[2] - 2 * (here.jacobian.T @ here.residual)[2])
+    difference = (objective(at(1.03 + 1e-4)) - objective(at(1.03 - 1e-4))) / 2e-4
+    assert slope == pytest.approx(difference, rel=within)
+
+
 def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values() -> None:
     gap, stop = 1.2e-3, 2e5
     report = diagnose(
