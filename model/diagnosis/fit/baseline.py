@@ -121,10 +121,13 @@ def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     settled, rules = 0, problem.rules.fit
     for _ in range(rules.renewals):
         before = problem.noise
-        noise = force_noise(fit.forward, fit.spectrum, before, problem.rules.noise)
-        if np.all(np.abs(noise.force / before.force - 1) < rules.renewed):
-            settled += 1
-            noise = sensor_noise(fit.forward, fit.spectrum, noise, problem.rules.noise)
+        try:
+            noise = force_noise(fit.forward, fit.spectrum, before, problem.rules.noise)
+            if np.all(np.abs(noise.force / before.force - 1) < rules.renewed):
+                settled += 1
+                noise = sensor_noise(fit.forward, fit.spectrum, noise, problem.rules.noise)
+        except np.linalg.LinAlgError:  # a fit whose responses are out of range keeps its levels
+            break
         renewed = replace(problem, noise=noise)
         enough = settled == (2 if problem.process_noise else 1)
         again = try_optimise(renewed, fit.point, 6 if enough else 2)
