@@ -214,13 +214,7 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     if float(np.max(misfit(base))) > state.options.rules.setup.misfit:
         return begun  # fixed until the missing law is found: before, they would diverge
     base = with_free_gains(begun, base)
-    if not problem.process_noise:
-        return replace(begun, base=base, fit=base)
-    # values found beside a strong unmeasured force are rough, and kept so they would keep it strong
-    problem, base = refreshed(problem, base)
-    screening = screen(problem, base, state.problem.system.catalogue, state.options.project)
-    begun = replace(begun, problem=problem, base=base, fit=base, first=screening, last=screening)
-    return replace(begun, held=replace(state.held, noise=problem.noise))
+    return replace(begun, base=base, fit=base)
 
 
 def _with_heavy_tails(fit: Fit, indices: range) -> tuple[Term, ...]:
