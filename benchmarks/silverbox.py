@@ -55,8 +55,10 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
         for key in ("baseline", "augmented"):
             findings = said["findings"] if key == "augmented" else []
             model = oscillator(said[key]["parameters"], findings)
-            offset = constant_force(model, record.values[:LEVELLED], system.sample_rate)
-            error = free_run_error(model, test.values, system.sample_rate, offset)
+            instruments = [*findings, *said["calibration"]] if key == "augmented" else []
+            trained, tested = (undone(values, instruments) for values in (record.values[:LEVELLED], test.values))
+            offset = constant_force(model, trained, system.sample_rate)
+            error = free_run_error(model, tested, system.sample_rate, offset)
             line[f"rmse_{key}_mv"] = 1e3 * error
         yield {**line, "met": line["rmse_augmented_mv"] <= target}
 
@@ -90,6 +92,16 @@ def oscillator(parameters: list[dict[str, Any]], findings: list[dict[str, Any]])
         return float(sum(force(d, v, p, k, c, 0.0, 0.0) for force, p in laws))
 
     return values["mass"], c, k, extra
+
+
+def undone(values: Array, instruments: list[dict[str, Any]]) -> Array:
+    """Drive and position, (T, 2), without the gains and offsets that a report has of them."""
+    found = values.copy()
+    of = {(one["location"], one["effect"]): float(one["parameters"][0]["value"]) for one in instruments}
+    for column, channel in enumerate(("drive", "position")):
+        found[:, column] -= of.get((channel, "sensor_bias"), 0.0)
+        found[:, column] /= of.get((channel, "sensor_gain"), 1.0)
+    return found
 
 
 def free_run(model: Model, drive: Array, rate: float, start: Array) -> Array:

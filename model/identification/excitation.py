@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from sprung.model.identification.frequency import FrequencyModel
@@ -143,7 +144,7 @@ def _force_band(system: System, band: Band) -> Band:
     return min(band[0], modes[0] / 2), min(max(band[1], 1.3 * modes[-1]), 0.4 * system.sample_rate)
 
 
-def _force_scale(frequency: FrequencyModel, audible: FloatArray) -> float:
+def _force_scale(frequency: FrequencyModel, audible: NDArray[np.bool_]) -> float:
     """Root mean square of white forces (N) that half of the sensors show at `_ABOVE_NOISE` times their noise."""
     system = frequency.simulator.system
     forces = frequency.simulator.forces.numpy() // 2

@@ -8,7 +8,8 @@ import pytest
 from sprung.model.laws.in_place import all_in_place
 from sprung.model.laws.structure import MODAL_DAMPING, elastic_modes, frame_of, sites_of
 from sprung.model.mechanics import Mechanics, state_matrix
-from sprung.model.system import SystemFileError, load_system, parse_system
+from sprung.model.schema import SystemFileError
+from sprung.model.system import load_system, parse_system
 
 BUILDING = """
 name: building

@@ -1,6 +1,7 @@
 """The same record as Parquet, MATLAB, HDF5, JSON, UFF, TDMS and NumPy, by libraries that others use; LabVIEW text."""
 
 import json
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -197,7 +198,7 @@ def _mat73_sheets(path: Path, sheets: FloatArray) -> None:
         raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
 
 
-SHEETS_OF = {
+SHEETS_OF: dict[str, Callable[[Path, FloatArray], object]] = {
     "a.mat": lambda path, sheets: scipy.io.savemat(path, {"runs": sheets}),
     "b.mat": _mat73_sheets,
     "a.npz": lambda path, sheets: np.savez(path, runs=sheets),
