@@ -109,9 +109,10 @@ def _elements(system: System) -> Table:
 
 
 def _modes(system: System) -> Table:
-    table = Table("frequency", "damping ratio", "moves most", title="Modes (nominal)", title_justify="left")
+    title = "Modes (nominal, without the laws)" if system.laws else "Modes (nominal)"
+    table = Table("frequency", "damping ratio", "moves most", title=title, title_justify="left")
     for mode in system.mechanics.modes(system.bodies):
-        table.add_row(f"{mode.frequency:.3g} Hz", f"{100 * mode.damping_ratio:.1f} %", mode.body)
+        table.add_row(f"{mode.frequency:.3g} Hz", f"{round(100 * mode.damping_ratio, 1) + 0.0:.1f} %", mode.body)
     return table
 
 
