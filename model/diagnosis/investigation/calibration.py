@@ -92,7 +92,7 @@ def _in_deviations(state: Investigation, term: Term) -> float:
 
 
 @dataclass(frozen=True)
-class _Deviation:
+class _EstimatedError:
     """An error in standard deviations of its data sheet, and the standard deviation of its estimate, likewise."""
 
     off: float
@@ -122,10 +122,10 @@ def is_outlier(fit: Fit, terms: Sequence[Term], key: tuple[str, str, str], rules
     return bool(2 * stdtr(len(others) - 1, -distance) * (len(others) + 1) < rules.by_chance)
 
 
-def _relative_deviations(fit: Fit, terms: Sequence[Term]) -> dict[tuple[str, str], _Deviation]:
+def _relative_deviations(fit: Fit, terms: Sequence[Term]) -> dict[tuple[str, str], _EstimatedError]:
     """Errors by place and kind, relative to the median of their kind."""
     at = {term.key: index for index, term in enumerate(fit.point.terms)}
-    away: dict[tuple[str, str], _Deviation] = {}
+    away: dict[tuple[str, str], _EstimatedError] = {}
     for kind in {term.law.name for term in terms}:
         alike = [term for term in terms if term.law.name == kind]
         sheet = np.array([term.scales[0] for term in alike])
@@ -135,13 +135,13 @@ def _relative_deviations(fit: Fit, terms: Sequence[Term]) -> dict[tuple[str, str
         covariance = apart @ (fit.covariance[np.ix_(places, places)] / np.outer(sheet, sheet)) @ apart
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         away |= {
-            (term.location, kind): _Deviation(float(value), float(s))
+            (term.location, kind): _EstimatedError(float(value), float(s))
             for term, value, s in zip(alike, off - np.median(off), std, strict=True)
         }
     return away
 
 
-def _scatter(errors: Sequence[_Deviation]) -> tuple[float, float]:
+def _scatter(errors: Sequence[_EstimatedError]) -> tuple[float, float]:
     """Mean of errors, and the standard deviation of one more of them, exactly known, about it."""
     off, variance = np.array([one.off for one in errors]), np.array([max(one.std, 1e-12) ** 2 for one in errors])
     weight = 1 / variance
