@@ -28,7 +28,7 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
-from sprung.model.diagnosis.selection.plausible import hardly_there
+from sprung.model.diagnosis.selection.plausible import hardly_there, out_of_range
 from sprung.model.laws import Law, SensorLaw
 from sprung.model.laws.base import DataSheet
 from sprung.model.laws.bodies import MASS_CHANGE
@@ -199,6 +199,8 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
         fitted = fitted if _anchored(state, fitted) else centred(fitted)
         if is_outlier(fit, fitted, first.key, state.options.rules.plausible):
             return replace(state, calibrations=0)
+        if any(out_of_range(term) for term in fitted):
+            return replace(state, calibrations=0)  # no errors, but another structure
         terms = tuple(_freed_beyond_tolerance(state, fitted))
         if [term.known for term in terms] == [term.known for term in fitted]:
             break
