@@ -22,10 +22,9 @@ from sprung.replay.bounds import check_piece, check_whole, mat_sizes
 from sprung.replay.extras import needed
 from sprung.replay.jsonkeys import load
 from sprung.replay.stamps import SECOND
-from sprung.replay.tables import Column, EvenTimes, whole
+from sprung.replay.tables import MOST_COLUMNS, Column, EvenTimes, whole
 
 DEEPEST = 8  # structures inside each other
-WIDEST = 10_000  # series of one array
 
 
 @contextmanager
@@ -111,7 +110,7 @@ def _series_in(shape: tuple[int, ...]) -> Iterator[tuple[str, int, Place]]:
     The longest axis is the time.  Where it is the last one, the others count backwards, as in HDF5 files of MATLAB.
     """
     along = int(np.argmax(shape)) if shape else 0
-    if max(shape, default=0) < 2 or math.prod(shape) // shape[along] > WIDEST:
+    if max(shape, default=0) < 2 or math.prod(shape) // shape[along] > MOST_COLUMNS:
         return
     others = [axis for axis in range(len(shape)) if axis != along]
     if along == len(shape) - 1:

@@ -158,12 +158,16 @@ WRONG_POSITION = StructureLaw(
 )
 
 
+def _heave(mechanics: Mechanics) -> FloatArray:
+    """One at the degrees of freedom that are heave, (n,)."""
+    return np.array([dof.endswith(".z") for dof in mechanics.dofs], dtype=float)
+
+
 def frame_of(mechanics: Mechanics) -> FloatArray:
     """What the bodies move relative to, as displacements of the supports (supports,): the ground, thus zeros; a single
     support where nothing else holds them."""
     supports = mechanics.G.shape[1]
-    heave = np.array([dof.endswith(".z") for dof in mechanics.dofs], dtype=float)
-    alone = supports == 1 and np.allclose(mechanics.H @ heave + mechanics.G[:, 0], 0.0)
+    alone = supports == 1 and np.allclose(mechanics.H @ _heave(mechanics) + mechanics.G[:, 0], 0.0)
     return np.ones(1) if alone else np.zeros(supports)
 
 
@@ -179,15 +183,22 @@ def elastic_modes(mechanics: Mechanics) -> tuple[FloatArray, FloatArray]:
     return np.sqrt(squares[elastic]), vectors[:, elastic] / root[:, None]
 
 
+def modal_dampers(mechanics: Mechanics) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Natural frequencies (rad/s, (m,)) of the elastic modes, and the deflections of dampers along them.
+
+    Over the degrees of freedom (m, n) and over the supports (m, supports).
+    """
+    omegas, shapes = elastic_modes(mechanics)
+    rows = (mechanics.mass[:, None] * shapes).T
+    return omegas, rows, -np.outer(rows @ _heave(mechanics), frame_of(mechanics))
+
+
 def _damped_by_mode(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
     """One damper per mode, along its modal coordinate: C = M (sum 2 zeta omega phi phi^T) M."""
-    frame, found = frame_of(mechanics), mechanics
-    heave = np.array([dof.endswith(".z") for dof in mechanics.dofs], dtype=float)
-    omegas, shapes = elastic_modes(mechanics)
-    for ratio, omega, shape in zip(p, omegas, shapes.T, strict=False):
+    found = mechanics
+    for ratio, omega, row, below in zip(p, *modal_dampers(mechanics), strict=False):
         if ratio > 0:
-            row = mechanics.mass * shape
-            found = with_element(found, row, 0.0, 2 * float(ratio) * float(omega), -(row @ heave) * frame)
+            found = with_element(found, row, 0.0, 2 * float(ratio) * float(omega), below)
     return found
 
 

@@ -20,7 +20,7 @@ from sprung.model.diagnosis.rules import ScreeningRules
 from sprung.model.diagnosis.screening.families import PART, STRUCTURE
 from sprung.model.diagnosis.screening.score import Candidate, Projector
 from sprung.model.laws import Law, StructureLaw
-from sprung.model.laws.structure import AXES, elastic_modes, frame_of, moved_row, point_rows, sites_of
+from sprung.model.laws.structure import AXES, elastic_modes, modal_dampers, moved_row, point_rows, sites_of
 from sprung.model.mechanics import Mechanics
 from sprung.model.schema import GROUND, SupportInput
 from sprung.model.signals import FloatArray
@@ -91,17 +91,14 @@ def _of_all_bodies(projector: Projector, law: StructureLaw) -> Iterator[tuple[Ca
         stiffness=structure.stiffness[: len(system.elements)],
         damping=structure.damping[: len(system.elements)],
     )
-    omegas, shapes = elastic_modes(mechanics)
-    if not len(omegas) or not _lightly_damped(mechanics, omegas, shapes, projector.problem.rules.screening):
+    if not _lightly_damped(mechanics, projector.problem.rules.screening):
         return
-    velocity = fit.motions.velocity[band][:, :n].copy()
-    heave = np.array([dof.endswith(".z") for dof in mechanics.dofs])
-    for support in np.flatnonzero(frame_of(mechanics)):
-        velocity[:, heave] -= _support_motion(projector, int(support))[1][:, None]
-    rows = (mechanics.mass[:, None] * shapes).T
+    velocity = fit.motions.velocity[band][:, :n]
+    omegas, rows, below = modal_dampers(mechanics)
     columns = []
-    for row, omega in zip(rows, omegas, strict=True):
-        force = -2 * omega * (velocity @ row)
+    for omega, row, under in zip(omegas, rows, below, strict=True):
+        supports = (under[s] * _support_motion(projector, int(s))[1] for s in np.flatnonzero(under))
+        force = -2 * omega * sum(supports, velocity @ row)
         columns.append(projector.pack((projector.of_load[:, :, :n] @ row) * force[:, None]))
     score, ratios = projector.nonnegative(np.stack(columns, axis=1))
     values = np.zeros(len(law.parameters))
@@ -112,8 +109,11 @@ def _of_all_bodies(projector: Projector, law: StructureLaw) -> Iterator[tuple[Ca
     yield Candidate(term, score, STRUCTURE), 1
 
 
-def _lightly_damped(mechanics: Mechanics, omegas: FloatArray, shapes: FloatArray, rules: ScreeningRules) -> bool:
-    """Whether most elastic modes are damped too little to be those of bodies on dampers."""
+def _lightly_damped(mechanics: Mechanics, rules: ScreeningRules) -> bool:
+    """Whether there are elastic modes, most of them damped too little to be those of bodies on dampers."""
+    omegas, shapes = elastic_modes(mechanics)
+    if not len(omegas):
+        return False
     C = (mechanics.H.T * mechanics.damping) @ mechanics.H
     ratios = np.einsum("nm,nk,km->m", shapes, C, shapes) / (2 * omegas)
     return bool(np.median(ratios) < rules.damped_lightly)
