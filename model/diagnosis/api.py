@@ -76,7 +76,7 @@ def diagnose(
             return diagnose_unforced(system, prepared, record, options, progress)
         record = RecordedPart(record.sample_rate, record.values[decay], record.lost)
     outcome = investigate(system, record, options, progress)
-    if not system.file.inputs and outcome.judgement.rejected is not None:
+    if not system.file.inputs and outcome.judgement.rejected:
         outcome = _along_what_was_seen(system, record, options, progress) or outcome
     progress(0.95, "report")
     report = compose(outcome, record)
@@ -95,4 +95,4 @@ def _along_what_was_seen(system: System, record: Recorded, options: Options, pro
     none = np.zeros((len(record.values), len(forces)))
     values = np.column_stack([none, record.values])
     outcome = investigate(pushed, RecordedPart(record.sample_rate, values, record.lost), options, progress)
-    return None if outcome.judgement.rejected is not None else outcome
+    return None if outcome.judgement.rejected else outcome

@@ -51,14 +51,17 @@ def judged(
     faults, physics = _kinds_of_faults(state, noisy), _kinds_of_physics(state)
     other = another_structure(state, deciding)
     verdict = verdict_of(faults + physics, deciding, rules, other_structure=other, ended=bool(ended))
-    rejected = float(np.sqrt(np.mean(deciding.after**2)))
+    error, unknown = float(np.sqrt(np.mean(deciding.after**2))), verdict == "unknown_physics"
+    rejected = bool(other) or (unknown and error > rules.rejected)
     return Judgement(
         errors=errors,
         verdict=verdict,
         floor=floor,
-        rejected=rejected if other or (verdict == "unknown_physics" and rejected > rules.rejected) else None,
-        parts=changed_parts(state) if other else 0,
+        error=error,
+        rejected=rejected,
         lost_phase=lost,
+        nothing_fits=rejected or (unknown and lost and error**2 > rules.gross),
+        parts=changed_parts(state) if other else 0,
         carried=_carries(verdict, physics),
         ended=ended,
         place=_place(state),

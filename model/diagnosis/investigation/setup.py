@@ -18,8 +18,16 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import baseline, refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.investigation.setup_effects import CorrectedFit, Hypothesis, SetupEffect, SetupPlace
+from sprung.model.diagnosis.investigation import setup_changes as changes
+from sprung.model.diagnosis.investigation.setup_effects import (
+    SIGN_REVERSED_BY_ONSET,
+    CorrectedFit,
+    Hypothesis,
+    SetupEffect,
+    SetupPlace,
+)
 from sprung.model.diagnosis.investigation.setup_hypotheses import hypotheses
+from sprung.model.diagnosis.investigation.setup_onset import begins_backwards, driving_point, velocity_of
 from sprung.model.diagnosis.investigation.setup_response import ModelResponse, relative
 from sprung.model.diagnosis.investigation.setup_scores import SetupScores
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
@@ -59,8 +67,9 @@ def without_setup_faults(
     present = misfit(fit)
     rules = problem.rules.setup
     while len(found) < rules.most and float(np.max(present)) > rules.misfit:
-        best = _best(system, signals, declared, split, problem, fit, present)
-        if best is None or _misfit_with_missing_part(problem, fit, best.fault.after) < rules.outdone * best.fault.after:
+        best = None if found else _reversed_by_onset(system, signals, declared, split, problem, fit)
+        best = best or _best(system, signals, declared, split, problem, fit, present)
+        if best is None or _is_outdone(best.fault, problem, fit):
             break
         system, signals, split, problem, fit = best.system, best.signals, best.split, best.problem, best.fit
         if any(best.fault.site.location == known.site.location for known in found):
@@ -68,6 +77,13 @@ def without_setup_faults(
         found.append(best.fault)
         present = misfit(fit)
     return system, signals, tuple(found)
+
+
+def _is_outdone(fault: SetupFault, problem: Problem, fit: Fit) -> bool:
+    """Whether a missing part explains the misfit better than a fault of the set-up."""
+    if fault.effect.model_free:
+        return False
+    return _misfit_with_missing_part(problem, fit, fault.after) < problem.rules.setup.outdone * fault.after
 
 
 def _misfit_with_missing_part(problem: Problem, fit: Fit, rival: float) -> float:
@@ -159,6 +175,32 @@ def _best(
         if not best.fault.effect.ordinary:
             return best
     return None  # a fault of one sensor is screened with the laws and validated on the held-out part
+
+
+def _reversed_by_onset(
+    system: System, signals: Signals, declared: Noise, split: int, problem: Problem, fit: Fit
+) -> _FittedFault | None:
+    """The force or the sensor beside it turned, where the response begins backwards; whatever else is wrong."""
+    beside = driving_point(system.mechanics)
+    if problem.worked_out or beside is None or beside not in problem.sensors:
+        return None
+    i, force, part = list(problem.sensors).index(beside), signals.force_names[0], problem.part
+    velocity = velocity_of(part, system.mechanics.sensor_kind[beside], i)
+    if not begins_backwards(part.grid.inverse(part.force[:, 0]), velocity, part.grid.compared, problem.rules.setup):
+        return None
+    turned = [(SetupPlace(force, detail=force), changes.turn(forces=[0]))]
+    if len(problem.sensors) > 1:  # a single sensor cannot tell which of the two is turned
+        turned.append((SetupPlace(signals.sensor_names[i], detail=force), changes.turn(sensors=[i])))
+    fitted, total = [], total_misfit(fit)
+    for site, undo in turned:
+        _, corrected = undo(system, signals)
+        try:
+            other, better = _fitted(system, corrected, declared, split, problem)
+        except DiagnosisError:
+            continue
+        fault = SetupFault(SIGN_REVERSED_BY_ONSET, site, None, 0.0, total, total_misfit(better))
+        fitted.append(_FittedFault(fault, system, corrected, split, other, better))
+    return min(fitted, key=_after, default=None)
 
 
 def _tried(

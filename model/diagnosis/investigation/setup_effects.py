@@ -48,6 +48,7 @@ class SetupEffect:
     parameter: tuple[str, str] | None = None  # name and unit of its value
     relative: bool = False  # the remaining fault is a share of its value
     ordinary: bool = False  # a fault of one sensor that screening tests: here only a rival
+    model_free: bool = False  # known whatever the structure: stands even if nothing fits
     undo: Callable[[SetupPlace, float], changes.Undo] | None = None  # of a value
     remaining: Callable[[SetupPlace, CorrectedFit], tuple[ChangeEstimate, float]] | None = (
         None  # in units of the second value
@@ -129,6 +130,11 @@ def _moved(
 
 
 SIGN_REVERSED = SetupEffect("sign_reversed", "{place}: the sign is reversed")
+SIGN_REVERSED_BY_ONSET = SetupEffect(
+    SIGN_REVERSED.name,
+    "{place}: the sign is reversed, for as recorded {detail} first moves its own point backwards",
+    model_free=True,
+)
 CHANNELS_SWAPPED = SetupEffect("channels_swapped", "{place}: exchanged")
 NODE_DELAY = SetupEffect(
     "node_delay",
@@ -151,5 +157,6 @@ WRONG_BODY = SetupEffect("wrong_body", "{place}: is not fixed to what the system
 ONE_GAIN = SetupEffect(SENSOR_GAIN.name, relative=True, ordinary=True, undo=_rescaled, remaining=_scaled)
 ONE_LAG = SetupEffect(SENSOR_LAG.name, ordinary=True, undo=_advanced, remaining=_late)
 SETUP_EFFECTS = (
-    SIGN_REVERSED, CHANNELS_SWAPPED, NODE_DELAY, WRONG_SCALE, SENSOR_POSITION, ELEMENT_POSITION, WRONG_BODY,
+    SIGN_REVERSED, SIGN_REVERSED_BY_ONSET, CHANNELS_SWAPPED, NODE_DELAY, WRONG_SCALE,
+    SENSOR_POSITION, ELEMENT_POSITION, WRONG_BODY,
 )  # fmt: skip

@@ -153,8 +153,10 @@ class Judgement:
     errors: HeldOutErrors  # of the held-out part, per sensor
     verdict: Verdict
     floor: FloatArray  # bounded noise, in the sensors' units, (S,)
-    rejected: float | None  # relative error of a rejected model; None if not rejected
+    error: float  # of the model over the signal; if its phase is lost, of unmeasured over inertia forces
+    rejected: bool  # whether the error rejects the model
     lost_phase: bool  # whether the verdict is based on unmeasured forces, not on the free run
+    nothing_fits: bool  # whether the model is rejected, or most is left of what is not known by phase
     parts: int  # number of structural changes, if too many to be plausible; else 0
     ended: str  # "budget of work" or "limit of time" that ended the search; else empty
     carried: bool  # whether the findings explain more than they leave

@@ -7,6 +7,8 @@ import numpy as np
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.values import deviations
 
+LOST_PHASE = "the free run loses its phase: the verdict is based not on its errors but on the unmeasured forces"
+
 
 def search_ended(limit: str) -> str:
     """Advice if a search ended at its budget of work or time limit."""
@@ -16,18 +18,22 @@ def search_ended(limit: str) -> str:
     )
 
 
-def nothing_fits(outcome: Outcome, rejected: float) -> str:
-    """Advice if the system file does not describe the recording, with likely reasons."""
-    parts = outcome.judgement.parts
-    if parts:
+def nothing_fits(outcome: Outcome) -> str:
+    """Advice if no model describes the recording, with likely reasons."""
+    judgement = outcome.judgement
+    if judgement.parts:
         return (
-            f"the structure is another one than the file's: {parts} changes of it (connections, masses, elements "
-            f"elsewhere) were found, which together imitate any other, and still err by {100 * rejected:.0f} % of the "
-            "signal; bodies, their degrees of freedom and what joins them should be stated anew"
+            f"the structure is another one than the file's: {judgement.parts} changes of it (connections, masses, "
+            f"elements elsewhere) were found, which together imitate any other, and still err by "
+            f"{100 * judgement.error:.0f} % of the signal; bodies, their degrees of freedom and what joins them should "
+            "be stated anew"
         )
+    share, likeliest = f"{100 * judgement.error:.0f} %", f"Likeliest: {'; '.join(likely_reasons(outcome))}"
+    if not judgement.rejected:
+        return f"nothing fits: {LOST_PHASE}, which are {share} of the inertia forces. {likeliest}"
     return (
-        f"nothing fits: the best model still errs by {100 * rejected:.0f} % of the signal; the system file does not "
-        f"seem to belong to this recording. Likeliest: {'; '.join(likely_reasons(outcome))}"
+        f"nothing fits: the best model still errs by {share} of the signal; the system file does not seem to "
+        f"belong to this recording. {likeliest}"
     )
 
 
@@ -46,7 +52,9 @@ def likely_reasons(outcome: Outcome) -> list[str]:
             scale = float(np.sqrt(np.sum(measured**2) / np.sum(simulated**2)))
             if not 1 / rules.scale < scale < rules.scale:
                 scales.append(f"{name} is {scale:.3g} times what it should show (a unit or a scale?)")
-    reasons = [f"the sign of {', '.join(turned)}"] if turned else []
+    doubted = [fault for fault in state.setup_faults if outcome.judgement.rejected and not fault.effect.model_free]
+    reasons = [fault.effect.describe(fault.site, "") for fault in doubted if fault.value is None]
+    reasons += [f"the sign of {', '.join(turned)}"] if turned else []
     reasons += scales[:1]
     sigma = np.sqrt(np.maximum(np.diag(state.base.covariance), 0))[: len(state.base.point.theta)]
     far = [

@@ -9,7 +9,7 @@ import numpy as np
 from sprung.model.diagnosis.investigation.calibration import calibration_indices
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome, Recorded
-from sprung.model.diagnosis.report.advice import nothing_fits, search_ended, undecided
+from sprung.model.diagnosis.report.advice import LOST_PHASE, nothing_fits, search_ended, undecided
 from sprung.model.diagnosis.report.calibration import calibration_of, in_words
 from sprung.model.diagnosis.report.findings import findings_of
 from sprung.model.diagnosis.report.plot_data import plot_data_of
@@ -31,14 +31,13 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
     state, before, after = outcome.investigation, outcome.before, outcome.after
     judgement, names = outcome.judgement, state.signals.sensor_names
     findings, calibration = findings_of(outcome), calibration_of(outcome)
-    advice = [*state.prepared.notes, *state.notes, *undecided(state)]
-    if judgement.rejected is not None:
-        advice.insert(0, nothing_fits(outcome, judgement.rejected))
-    elif judgement.lost_phase and not state.held.still:
-        advice.insert(
-            0,
-            "the free run loses its phase: the verdict is based on the unmeasured forces, not on its errors",
-        )
+    advice = [*state.prepared.notes, *state.notes]
+    if judgement.nothing_fits:
+        advice.insert(0, nothing_fits(outcome))
+    else:
+        advice += undecided(state)
+        if judgement.lost_phase and not state.held.still:
+            advice.insert(0, LOST_PHASE)
     if judgement.ended:
         advice.insert(0, search_ended(judgement.ended))
     rules = state.options.rules.verdict
@@ -164,12 +163,12 @@ def _candidates(state: Investigation) -> tuple[CandidateRow, ...]:
 
 def _summary(outcome: Outcome, findings: list[Finding], explained: float | None, calibration: str) -> str:
     judgement = outcome.judgement
-    beside = f"; {calibration}" if calibration and judgement.rejected is None else ""
+    beside = f"; {calibration}" if calibration and not judgement.rejected else ""
     if judgement.verdict == "consistent":
         return f"The nominal structure explains the recording down to the noise{beside}."
     where = f": {judgement.where}" if judgement.where else ""
     text = "; ".join(f.sentence for f in findings) or f"Nothing in the system file fits this recording{where}"
-    if judgement.carried and judgement.rejected is None and explained is not None and explained > 0:
+    if judgement.carried and not judgement.rejected and explained is not None and explained > 0:
         share = "100" if not judgement.where else f"{min(100 * explained, 99):.0f}"
         text += f"; explains {share} % of the excess error"
         if judgement.where:

@@ -24,8 +24,8 @@ from sprung.model.system import System
 def findings_of(outcome: Outcome) -> list[Finding]:
     """Findings, strongest first: stuck channels, then by the reduction of chi-square."""
     state, judgement = outcome.investigation, outcome.judgement
-    if judgement.rejected is not None:
-        return []
+    if judgement.rejected:
+        return [_setup_finding(fault) for fault in state.setup_faults if fault.effect.model_free]
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in state.prepared.stuck]
     ranked += [(np.inf, _setup_finding(f)) for f in state.setup_faults]
     ranked += [
@@ -186,6 +186,7 @@ def _setup_finding(fault: SetupFault) -> Finding:
         parameters = (LawParameter(name, fault.value, fault.std, unit),)
     sentence = fault.effect.describe(fault.site, parameters[0].words() if parameters else "")
     share = 100 * (1 - fault.after / fault.before)
+    gone = f"; put right, {share:.0f} % of the misfit goes" if share >= 1 else ""
     return Finding(
         location=fault.site.location,
         effect=fault.effect.name,
@@ -193,7 +194,7 @@ def _setup_finding(fault: SetupFault) -> Finding:
         parameters=parameters,
         p_value=None,
         delta_bic=None,
-        sentence=f"{sentence}; put right, {share:.0f} % of the misfit goes",
+        sentence=f"{sentence}{gone}",
     )
 
 
