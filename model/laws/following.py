@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter, lfilter_zi
 
 from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
 from sprung.model.signals import FloatArray
@@ -47,9 +48,25 @@ class Covariate:
         """Unit of a relative slope."""
         return f"1/{self.unit}" if self.unit != "1" else "1"
 
-    def above(self, time: FloatArray) -> FloatArray:
-        """The signal less its reference at times on the laws' clock."""
-        return np.interp(time, self.time, self.series) - self.reference
+    @property
+    def step(self) -> float:
+        """Time between samples, s."""
+        return float(self.time[1] - self.time[0])
+
+    def above(self, time: FloatArray, lag: float = 0.0) -> FloatArray:
+        """The signal less its reference at times on the laws' clock.
+
+        lag: time constant of a first-order lag of its effect, s, as of a coil or a valve; exact for a signal that is
+        linear between samples and constant before the first.
+        """
+        series = self.series - self.reference
+        if lag > 0.0:
+            share = self.step / lag
+            kept = np.exp(-share)
+            mean = (1 - kept) / share
+            numerator, denominator = [1 - mean, mean - kept], [1.0, -kept]
+            series, _ = lfilter(numerator, denominator, series, zi=lfilter_zi(numerator, denominator) * series[0])
+        return np.interp(time, self.time, series)
 
 
 def following_law(quantity: str, signal: Covariate, elements: tuple[str, ...] = ()) -> ElementLaw:

@@ -129,12 +129,10 @@ def _parameters(
 def _candidates(one: JudgedComponent) -> list[CandidateRow]:
     rows: dict[str, CandidateRow] = {}
     for step in one.found.steps:
-        for ranked in (step.chosen, *step.rivals):
+        for ranked, piece in ((step.chosen, step.piece), *((rival, rival.last) for rival in step.rivals)):
             delta = step.rival_bic(ranked)
             p_value = chance(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, one.found.tests)
-            rows.setdefault(
-                ranked.last.effect, CandidateRow(one.record.element, ranked.last.effect, ranked.gain, p_value, delta)
-            )
+            rows.setdefault(piece.effect, CandidateRow(one.record.element, piece.effect, ranked.gain, p_value, delta))
     for effect, gain in one.found.screened.items():
         rows.setdefault(effect, CandidateRow(one.record.element, effect, gain, chance(gain, 2, one.found.tests)))
     return list(rows.values())[:20]

@@ -100,14 +100,14 @@ def _only_one_loop(judged: JudgedComponent) -> bool:
     The held-out part repeats the same loop and cannot refute them.
     """
     task, found = judged.final.task, judged.found.steps
-    if len(found) < 2 or task.signals or not any(step.chosen.last.kind is HYSTERESIS for step in found):
+    if len(found) < 2 or task.signals or not any(step.piece.kind is HYSTERESIS for step in found):
         return False
     return task.motion.repeats(task.rules)
 
 
 def _least(steps: tuple[Step, ...], rules: ComponentRules) -> float:
     """Least share of the excess power that true laws explain; more for several laws, which are more flexible."""
-    one = len(steps) < 2 and not any(isinstance(p, Piece) and p.imitates for p in (s.chosen.last for s in steps))
+    one = len(steps) < 2 and not any(isinstance(p, Piece) and p.imitates for p in (s.piece for s in steps))
     return rules.named if one else 1 - rules.together
 
 

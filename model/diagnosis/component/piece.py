@@ -9,7 +9,7 @@ Strengths, k, c and preload follow by linear least squares for given shapes (var
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -114,6 +114,7 @@ class Piece:
     believed: Believed = lambda fitted: True  # whether values are plausible for the record
     imitates: bool = False  # so flexible that it must leave as little as several laws
     at_low_rates: ElementLaw | None = None  # law that it is equivalent to at low rates
+    yields_with_rate: bool = False  # a yield force above a rate, with a steep slope below it
 
     @property
     def dissipates(self) -> bool:
@@ -160,10 +161,17 @@ class Piece:
 
 @dataclass(frozen=True)
 class Following:
-    """A law whose strengths depend linearly on a measured signal, about its mean."""
+    """A law whose strengths depend linearly on a measured signal, about its mean.
+
+    keeps_slope: its yield force does, and the steep slope at rates below yielding stays, as of a magnetorheological
+    damper, whose fluid is as viscous at any current.  lagged: the dependence has a first-order lag (Spencer, Dyke, Sain
+    and Carlson 1997).
+    """
 
     piece: Piece
     signal: Covariate
+    keeps_slope: bool = False
+    lagged: bool = False
 
     @property
     def law(self) -> ElementLaw:
@@ -193,46 +201,79 @@ class Following:
     def dissipates(self) -> bool:
         return self.piece.dissipates
 
-    @property
-    def believed(self) -> Believed:
-        return self.piece.believed
+    def believed(self, fitted: FittedPiece) -> bool:
+        """Whether the law's own values are plausible."""
+        return self.piece.believed(replace(fitted, shape=fitted.shape[: len(self.piece.shapes)]))
 
     @property
     def plain(self) -> int:
-        return self.piece.plain + 1
+        return self.piece.plain + 1 + self.lagged
 
     @property
     def shapes(self) -> tuple[str, ...]:
-        return self.piece.shapes
+        of_slope, of_lag = ("slope",) * self.keeps_slope, ("lag",) * self.lagged
+        return (*self.piece.shapes, *of_slope, *of_lag)
 
     @property
     def signs(self) -> tuple[int, ...]:
-        return (*self.piece.signs, *(0 for _ in self.piece.signs))
+        return self.piece.signs if self.keeps_slope else (*self.piece.signs, *(0 for _ in self.piece.signs))
+
+    @property
+    def forms(self) -> tuple[Following, ...]:
+        """Further forms of the plain one."""
+        if self.keeps_slope or self.lagged:
+            return ()
+        forms = ((False, True), *(((True, False), (True, True)) if self.piece.yields_with_rate else ()))
+        return tuple(replace(self, keeps_slope=keeps, lagged=late) for keeps, late in forms)
+
+    def starts(self, strengths: FloatArray, shape: Shape) -> list[tuple[float, ...]]:
+        """Shapes from which it is refined, by the strengths and shapes of the plain form."""
+        count = len(self.piece.signs)
+        slope = strengths[count] / strengths[0] if len(strengths) > count and strengths[0] != 0 else 1.0
+        slopes = (float(np.clip(slope, *self._slopes)),) * self.keeps_slope
+        lags = [(late * self.signal.step,) for late in _FIRST_LAGS] if self.lagged else [()]
+        return [(*shape[: len(self.piece.shapes)], *slopes, *late) for late in lags]
+
+    @property
+    def _slopes(self) -> tuple[float, float]:
+        """Relative changes per standard deviation of the signal, for which the yield force is never negative."""
+        above = (self.signal.series - self.signal.reference) / self.signal.size
+        return -1 / float(np.max(above)), -1 / float(np.min(above))
 
     def grid(self, seen: MotionSizes) -> FloatArray:
         return self.piece.grid(seen)
 
     def limits(self, seen: MotionSizes) -> list[tuple[float, float]]:
-        return self.piece.limits(seen)
+        lags = [(0.3 * self.signal.step, 0.1 * seen.seconds)] if self.lagged else []
+        return [*self.piece.limits(seen), *([self._slopes] if self.keeps_slope else []), *lags]
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
-        steady = self.piece.columns(motion, shape)
-        above = self.signal.above(motion.time + CLOCK_LEAD) / self.signal.size
+        own, lag = shape[: len(self.piece.shapes)], shape[-1] if self.lagged else 0.0
+        above = self.signal.above(motion.time + CLOCK_LEAD, lag) / self.signal.size
+        if self.keeps_slope:
+            yields = np.maximum(1 + shape[len(own)] * above, _LEAST_YIELD)
+            along = replace(motion, rate=motion.rate / yields, dense=None, stride=1)
+            return self.piece.columns(along, own) * yields[:, None]
+        steady = self.piece.columns(motion, own)
         return np.column_stack([steady, steady * above[:, None]])
 
     def values(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
         """The law's parameters at the signal's mean, and the relative change of its first strength per unit."""
         count = len(self.piece.signs)
-        first = strengths[0] if strengths[0] != 0 else 1e-300
-        slope = float(strengths[count] / (first * self.signal.size))
-        found = self.piece.values(strengths[:count], shape, element)
-        return found | {f"{self.signal.name}_slope": (slope, self.signal.per_unit)}
+        if self.keeps_slope:
+            slope = float(shape[len(self.piece.shapes)] / self.signal.size)
+        else:
+            slope = float(strengths[count] / ((strengths[0] if strengths[0] != 0 else 1e-300) * self.signal.size))
+        found = self.piece.values(strengths[:count], shape[: len(self.piece.shapes)], element)
+        found = found | {f"{self.signal.name}_slope": (slope, self.signal.per_unit)}
+        return found | ({f"{self.signal.name}_lag": (float(shape[-1]), "s")} if self.lagged else {})
 
     def quoted(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
         """What is quoted of the law, at the signal's mean and per unit of it."""
-        count = len(self.piece.signs)
-        steady = self.piece.quoted(strengths[:count], shape, element)
-        moved = self.piece.quoted(strengths[:count] + strengths[count:] / self.signal.size, shape, element)
+        count, own = len(self.piece.signs), shape[: len(self.piece.shapes)]
+        change = (strengths * shape[len(own)] if self.keeps_slope else strengths[count:]) / self.signal.size
+        steady = self.piece.quoted(strengths[:count], own, element)
+        moved = self.piece.quoted(strengths[:count] + change, own, element)
         per = {
             f"{name}_per_{self.signal.name}": (moved[name][0] - value, f"{unit}/{self.signal.unit}")
             for name, (value, unit) in steady.items()
@@ -325,6 +366,8 @@ class Lag:
 
 
 _REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
+_FIRST_LAGS = (3.0, 30.0)  # samples of a signal, from which a lag is refined
+_LEAST_YIELD = 0.02  # of the yield force at a signal's mean
 _RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate, knots of a force over it
 SURFACE = SliderSurface()
 LAGS = (Lag(), Lag(filters=True))

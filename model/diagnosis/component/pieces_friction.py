@@ -67,6 +67,7 @@ _COULOMB = Piece(
     lambda a, s, e: {"breakaway_force": (a[0], "N")},
     kind=FRICTION,
     at_low_rates=DAMPER_BLOWOFF,
+    yields_with_rate=True,
 )
 _STRIBECK = Piece(
     STRIBECK,

@@ -55,6 +55,12 @@ class Step:
     rivals: tuple[Ranked, ...]  # other laws in its place, best first
     p_value: float
     forms: tuple[Ranked, ...] = ()  # other forms of the same law
+    index: int = -1  # of the law among the chosen model's
+
+    @property
+    def piece(self) -> Part:
+        """The accepted law."""
+        return self.chosen.fit.model.pieces[self.index]
 
     @property
     def gain(self) -> float:
@@ -63,8 +69,7 @@ class Step:
     @property
     def delta_bic(self) -> float:
         """BIC of the chosen law over the model without it."""
-        last = self.chosen.last
-        return bic(self.gain, len(last.signs) + len(last.shapes), int(self.chosen.count))
+        return bic(self.gain, len(self.piece.signs) + len(self.piece.shapes), int(self.chosen.count))
 
     def rival_bic(self, rival: Ranked) -> float:
         """BIC of another law in its place."""
@@ -138,9 +143,9 @@ def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, progres
         if step is None:
             break
         steps.append(step)
-        current = _swapped(step.chosen, pieces, rules, given)
-        if current is not step.chosen:  # an earlier law was exchanged
-            steps = _renamed(steps, current, given, tests)
+        current = _formed(_swapped(step.chosen, pieces, rules, given), rules, given)
+        if current is not step.chosen:  # an earlier law was exchanged, or one has another form
+            steps = _renamed(steps, current, given, tests, rules)
     return _SelectedLaws(current, tuple(steps), first)
 
 
@@ -389,17 +394,42 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
     return best
 
 
-def _renamed(steps: list[Step], current: Ranked, given: int, tests: int) -> list[Step]:
-    """Steps of a model after an exchange: every law over the model without it."""
+def _formed(chosen: Ranked, rules: ComponentRules, given: int) -> Ranked:
+    """The same with laws that follow a signal in another form, if that gains the naming margin in evidence."""
+    best = chosen
+    for index in range(given, len(chosen.fit.model.pieces)):
+        model = best.fit.model
+        piece = model.pieces[index]
+        if not isinstance(piece, Following):
+            continue
+        strengths, shape = best.fit.strengths_of(index), model.shapes[index]
+        others = [
+            refined(chosen.fit.task, model.replaced(index, form, start))
+            for form in piece.forms
+            for start in form.starts(strengths, shape)
+        ]
+        rest = fitted(chosen.fit.task, model.without(index))
+        ranked = _rank([*(fit for fit in others if plausible(fit, index)), best.fit], rest, rules)
+        own = next(r for r in ranked if r.fit is best.fit)
+        better = ranked[0].evidence > own.evidence + rules.naming_margin
+        best = ranked[0] if better and ranked[0].fit.held_out < own.fit.held_out else best
+    return best
+
+
+def _renamed(steps: list[Step], current: Ranked, given: int, tests: int, rules: ComponentRules) -> list[Step]:
+    """Steps of a model after an exchange: every law, and its rivals, over the model without it."""
     model = current.fit.model
     result = []
     for index in range(given, len(model.pieces)):
-        without = fitted(current.fit.task, model.without(index))
-        gain = level_gain(without.error, current.fit.error, current.count)
-        ranked = Ranked(without, 0.0, 0.0, current.count)
         piece = model.pieces[index]
-        p_value = chance(gain, len(piece.signs) + len(piece.shapes), tests)
-        known = next((s for s in steps if s.chosen.last.effect == piece.effect), None)
-        others = (known.rivals, known.forms) if known else ((), ())
-        result.append(Step(current, ranked, others[0], p_value, others[1]))
+        known = next((s for s in steps if s.piece.effect == piece.effect), None)
+        rivals, forms = (known.rivals, known.forms) if known else ((), ())
+        without = fitted(current.fit.task, model.without(index))
+        ranked = _rank([current.fit, *(r.fit for r in (*rivals, *forms))], without, rules)
+        chosen = next(r for r in ranked if r.fit is current.fit)
+        p_value = chance(chosen.gain, len(piece.signs) + len(piece.shapes), tests)
+        others = [r for r in ranked if r is not chosen]
+        before = Ranked(without, 0.0, 0.0, chosen.count)
+        same = tuple(r for r in others if r.last.effect == piece.effect)
+        result.append(Step(chosen, before, tuple(r for r in others if r not in same), p_value, same, index))
     return result

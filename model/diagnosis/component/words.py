@@ -156,15 +156,11 @@ def unknown_finding(element: str, step: Step, laws: tuple[Step, ...], *, mapped:
     sentence = f"{element}: a force that no law of the catalogue explains{'; its map is reported' if mapped else ''}"
     closest = None
     if laws:
-        last = laws[-1].chosen
-        names = " and ".join(dict.fromkeys(s.chosen.last.effect.replace("_", " ") for s in laws))
-        left = np.sqrt(last.fit.held_out / max(laws[0].before.fit.held_out, 1e-300))
+        first, last = laws[0], laws[-1].chosen
+        names = " and ".join(dict.fromkeys(s.piece.effect.replace("_", " ") for s in laws))
+        left = np.sqrt(last.fit.held_out / max(first.before.fit.held_out, 1e-300))
         sentence += f"; {names} would come closest and leave {100 * left:.0f} % of the error"
-        first = laws[0].chosen
-        closest = (
-            first.last.effect,
-            bic(first.gain, len(first.last.signs) + len(first.last.shapes), int(first.count)),
-        )
+        closest = first.piece.effect, first.delta_bic
     return Finding(
         element,
         UNKNOWN,

@@ -137,6 +137,7 @@ class _FittedFault:
     split: int  # number of fitted samples
     problem: Problem
     fit: Fit
+    by_mass: bool = False  # read from frequencies above all modes
 
 
 def _best(
@@ -149,22 +150,19 @@ def _best(
     present: FloatArray,
 ) -> _FittedFault | None:
     """The fitted hypothesis that explains most, if one explains enough."""
-    rules, total = problem.rules.setup, float(np.sum(present))
+    rules = problem.rules.setup
+    total = float(np.sum(np.minimum(present, 1.0)))  # a prediction of nothing leaves 1 of every sensor
     accepted: list[_FittedFault] = []
     refined: dict[int, _FittedFault] = {}  # by the identity of the accepted one
     for ranked in _ranked(system, signals, problem, fit, total):
-        for hypothesis in _best_on_a_stretch(ranked, system, signals, declared, problem):
-            if problem.worked_out:
-                return None
-            one = _tried(hypothesis, system, signals, declared, split, problem, total)
-            if one is not None and hypothesis is ranked[0] and one.fault.after >= rules.explains * total:
-                one = _refined(one, declared)  # its value was read beside parameters that had absorbed part
-            if one is None or one.fault.after >= rules.explains * total:
-                continue
-            if hypothesis.by_mass:  # independent of stiffnesses, which absorb part of the others
-                return _refined(one, declared)
-            accepted.append(one)
-        accepted.sort(key=_after)
+        fitted = _fits(ranked, system, signals, declared, split, problem, total)
+        explaining = [one for one in fitted if one.fault.after < rules.explains * total]
+        if fitted and not explaining:  # by their values, read beside parameters that had absorbed part of them
+            again = (_refined(one, declared) for one in _leading(fitted))
+            explaining = [one for one in again if one.fault.after < rules.explains * total]
+        if explaining and explaining[0].by_mass:  # independent of stiffnesses, which absorb part of the others
+            return _refined(explaining[0], declared)
+        accepted = sorted([*accepted, *explaining], key=_after)
         rivals = _rivals(accepted, rules.rivals)
         if all(one.fault.effect.ordinary for one in rivals):
             continue
@@ -175,6 +173,36 @@ def _best(
         if not best.fault.effect.ordinary:
             return best
     return None  # a fault of one sensor is screened with the laws and validated on the held-out part
+
+
+def _fits(
+    ranked: list[Hypothesis],
+    system: System,
+    signals: Signals,
+    declared: Noise,
+    split: int,
+    problem: Problem,
+    total: float,
+) -> list[_FittedFault]:
+    """Hypotheses fitted, in their order; the first that explains enough alone if it is read from masses only."""
+    rules, found = problem.rules.setup, list[_FittedFault]()
+    for hypothesis in _best_on_a_stretch(ranked, system, signals, declared, problem):
+        if problem.worked_out:
+            return []
+        one = _tried(hypothesis, system, signals, declared, split, problem, total)
+        if one is not None and one.by_mass and one.fault.after < rules.explains * total:
+            return [one]
+        found += [one] if one is not None else []
+    return found
+
+
+def _leading(fitted: list[_FittedFault]) -> list[_FittedFault]:
+    """Of fitted hypotheses with a value the first, which leads by spectra, and the one that leaves least."""
+    valued = [one for one in fitted if one.fault.value is not None and not one.fault.effect.ordinary]
+    if not valued:
+        return []
+    best = min(valued, key=_after)
+    return [best] if best is valued[0] else [valued[0], best]
 
 
 def _reversed_by_onset(
@@ -222,7 +250,8 @@ def _tried(
     remaining = total_misfit(fit)
     if remaining >= problem.rules.setup.promising * total:
         return None
-    return _FittedFault(_fault(hypothesis, total, remaining), changed, corrected, split, other, fit)
+    fault = _fault(hypothesis, total, remaining)
+    return _FittedFault(fault, changed, corrected, split, other, fit, hypothesis.by_mass)
 
 
 def _best_on_a_stretch(
@@ -250,7 +279,7 @@ def _best_on_a_stretch(
         except DiagnosisError:
             return np.inf
 
-    most = rules.on_a_stretch * misfit_of(None)
+    most = rules.on_a_stretch * min(misfit_of(None), float(stretch.sensors.shape[1]))
     by_misfit = [(misfit_of(hypothesis), number) for number, hypothesis in enumerate(ranked)]
     good = sorted(one for one in by_misfit if one[0] < most)[: rules.tried]
     return [ranked[number] for number in sorted(number for _, number in good)]
@@ -275,7 +304,7 @@ def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total:
     """Hypotheses to be fitted, the most promising first: of channels, then of the system file."""
     rules = problem.rules.setup
     ranking = _promising(system, signals, problem, fit)
-    unranked = [h for h in ranking if h.misfit >= rules.promising and not h.by_mass]
+    unranked = [h for h in ranking if h.unranked and not h.by_mass] if problem.process_noise else []
     unranked = unranked if len(unranked) <= rules.few else []
     ranked = [h for h in ranking if h.by_mass]
     ranked += [h for h in ranking if not h.effect.ordinary and h not in (*unranked, *ranked)][: rules.tried] + unranked

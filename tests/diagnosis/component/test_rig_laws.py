@@ -124,6 +124,31 @@ def test_friction_that_a_voltage_makes_stronger_is_followed() -> None:
     assert per_volt.unit == "N/V"
 
 
+def late(signal: np.ndarray, time_constant: float) -> np.ndarray:
+    """Through a first-order lag, in fine steps; constant before the start."""
+    found, y = np.empty(len(signal)), signal[0]
+    for i, x in enumerate(signal):
+        found[i] = y
+        for _ in range(50):
+            y += (x - y) / (50 * RATE * time_constant)
+    return found
+
+
+def test_a_yield_force_that_follows_a_voltage_late_keeps_its_slope_below_yielding() -> None:
+    """As of a magnetorheological damper: the current takes its time, and the fluid is as viscous at any current."""
+    u = voltage()
+    yields = 60 + 50 * late(u, 0.05)
+    report = diagnosed(K * D + 300 * V + yields * np.tanh(4e3 * V / yields), signals={"valve": u})
+    first = next(f for f in report.findings if f.effect != "preload")
+    values = {q.name: q for q in (*first.parameters, *first.quoted)}
+    assert (first.effect, first.family) == ("coulomb_friction", None)
+    lag, per_volt = values["valve_lag"], values["breakaway_force_per_valve"]
+    assert abs(lag.value - 0.05) < max(4 * lag.std, 0.002) and lag.unit == "s"
+    assert abs(per_volt.value - 50) < 3 * per_volt.std < 6
+    assert values["force"].value / values["smoothing"].value == pytest.approx(4e3, rel=0.05)
+    assert report.augmented_validation.nrmse < 2 * report.noise_floor.nrmse
+
+
 def test_what_does_not_follow_a_signal_is_not_said_to() -> None:
     report = diagnosed(K * D + C * V, signals={"valve": voltage()})
     assert report.verdict == "consistent"
