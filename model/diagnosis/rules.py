@@ -341,6 +341,7 @@ class SetupRules:
     gravity_least: float = rule(5.0, "ratio by spectra alone, that may be standard gravity; chosen", 3.0, 7.0)
     gravity_most: float = rule(20.0, "the same; chosen", 14.0, 30.0)
     gravity: float = rule(0.1, "of a log-ratio, within which it is standard gravity; chosen", 0.05, 0.2)
+    in_common: float = rule(0.5, "samples between lags that are one delay; derived: a clock's rounding", 0.25, 1.0)
     segments: int = rule(8, "of a recording, for a frequency response without a model; chosen", 5, 16)
     unexcited: float = rule(0.01, "of the largest power of a force, below which it excites nothing; chosen", 3e-3, 0.03)
     onset: float = rule(8.0, "times what precedes an impulse, of a response that begins with it; chosen", 5.0, 12.0)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.common_delay import common_delay
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import (
@@ -19,6 +20,7 @@ from sprung.model.diagnosis.investigation.named_laws import with_laws_together, 
 from sprung.model.diagnosis.investigation.next_finding import next_finding
 from sprung.model.diagnosis.investigation.redundant import without_redundant
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
+from sprung.model.diagnosis.investigation.setup_effects import Hypothesis
 from sprung.model.diagnosis.investigation.significance import (
     shared_gain_covariance,
     without_insignificant,
@@ -51,7 +53,12 @@ def investigate(system: System, record: Recorded, options: Options, progress: Pr
 
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
-    return concluded(with_findings(begun(system, record, options, progress), progress), progress)
+    state = with_findings(begun(system, record, options, progress), progress)
+    together = common_delay(state)
+    if together is not None:
+        again = begun(system, record, options, progress, together)
+        state = with_findings(again, progress) if again.setup_faults else state
+    return concluded(state, progress)
 
 
 def with_findings(state: Investigation, progress: Progress) -> Investigation:
@@ -71,6 +78,8 @@ def with_findings(state: Investigation, progress: Progress) -> Investigation:
         state = without_redundant(state)
         if _still_rejected(state, before.fit) or another_structure(state):
             break  # further findings would only imitate another structure
+        if common_delay(state) is not None:
+            break  # it is put right before anything else is sought
     return state
 
 
@@ -115,8 +124,13 @@ def under(state: Investigation, rules: Rules) -> Investigation:
     )
 
 
-def begun(system: System, record: Recorded, options: Options, progress: Progress) -> Investigation:
-    """The nominal structure on the recording, with faulty inputs compensated, and its held-out part."""
+def begun(
+    system: System, record: Recorded, options: Options, progress: Progress, suspected: Hypothesis | None = None
+) -> Investigation:
+    """The nominal structure on the recording, with faulty inputs compensated, and its held-out part.
+
+    suspected: a fault of the set-up that is tried before all others.
+    """
     progress(0.02, "channels and noise")
     options = replace(options, work=options.work or WorkBudget(options.rules.fit.work))
     prepared = prepare(system, system.undistorted(record.values), record.sample_rate, options.rules.record)
@@ -125,7 +139,9 @@ def begun(system: System, record: Recorded, options: Options, progress: Progress
     progress(0.05, "nominal structure identified again; screening all laws at all places")
     start = nominal(system, signals, declared, split, options)
     progress(0.15, "set-up: signs, channels, nodes, scales, positions")
-    system, corrected, setup = without_setup_faults(system, signals, declared, split, start.problem, start.fit)
+    system, corrected, setup = without_setup_faults(
+        system, signals, declared, split, start.problem, start.fit, suspected
+    )
     if setup:
         split, signals = fitted_samples(signals, corrected, split), corrected
         start = nominal(system, signals, declared, split, options)

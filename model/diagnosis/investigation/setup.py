@@ -58,16 +58,29 @@ class SetupFault:
 
 
 def without_setup_faults(
-    system: System, signals: Signals, declared: Noise, split: int, problem: Problem, fit: Fit
+    system: System,
+    signals: Signals,
+    declared: Noise,
+    split: int,
+    problem: Problem,
+    fit: Fit,
+    suspected: Hypothesis | None = None,
 ) -> tuple[System, Signals, tuple[SetupFault, ...]]:
-    """System and signals corrected for faults of the set-up, and these faults."""
+    """System and signals corrected for faults of the set-up, and these faults.
+
+    suspected: a hypothesis that is fitted before all others.
+    """
     found: list[SetupFault] = []
     if not (np.any(signals.force) or signals.support_names or system.on_track):
         return system, signals, ()  # without measured inputs there is no prediction to compare sensors with
     present = misfit(fit)
     rules = problem.rules.setup
     while len(found) < rules.most and float(np.max(present)) > rules.misfit:
-        best = None if found else _reversed_by_onset(system, signals, declared, split, problem, fit)
+        best = None
+        if not found and suspected is not None:
+            best = _confirmed(suspected, system, signals, declared, split, problem, present)
+        elif not found:
+            best = _reversed_by_onset(system, signals, declared, split, problem, fit)
         best = best or _best(system, signals, declared, split, problem, fit, present)
         if best is None or _is_outdone(best.fault, problem, fit):
             break
@@ -173,6 +186,22 @@ def _best(
         if not best.fault.effect.ordinary:
             return best
     return None  # a fault of one sensor is screened with the laws and validated on the held-out part
+
+
+def _confirmed(
+    suspected: Hypothesis,
+    system: System,
+    signals: Signals,
+    declared: Noise,
+    split: int,
+    problem: Problem,
+    present: FloatArray,
+) -> _FittedFault | None:
+    """A hypothesis fitted and estimated again, if it then explains enough."""
+    total = float(np.sum(np.minimum(present, 1.0)))
+    one = _tried(suspected, system, signals, declared, split, problem, total)
+    one = None if one is None else _refined(one, declared)
+    return one if one is not None and one.fault.after < problem.rules.setup.explains * total else None
 
 
 def _fits(
