@@ -29,6 +29,23 @@ def _coulomb(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     return found
 
 
+def _sliding(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    force, smoothing, slow, rate = p
+    v = motion.rate
+    found: FloatArray = np.tanh(v / smoothing) * (force + (slow - force) * np.exp(-np.abs(v) / rate))
+    return found
+
+
+def _slow_forces(p: Values, seen: Observed) -> tuple[tuple[float, ...], ...]:
+    force, smoothing = p
+    rate = _TURNS * max(seen.rate_rms, 1e-12)
+    return tuple((fast * force, min(smoothing, 0.3 * rate), slow * force, rate) for fast, slow in _FAST_AND_SLOW)
+
+
+_TURNS = 0.3  # of the rms rate, within which friction changes to that of fast sliding
+_FAST_AND_SLOW = ((1.2, 0.5), (0.9, 1.5))  # times a constant friction that was read
+
+
 def _coulomb_shapes(seen: Observed) -> FloatArray:
     widest = max(seen.rate_rms, 1e-12)
     return grid([0.1 * seen.damping * widest + 0.05 * seen.stiffness * seen.deflection_rms], widest * _WIDTHS)
@@ -36,7 +53,7 @@ def _coulomb_shapes(seen: Observed) -> FloatArray:
 
 _WIDTHS = np.array([0.02, 0.07, 0.2, 0.6])
 
-COULOMB_FRICTION = ElementLaw(
+_COULOMB = ElementLaw(
     name="coulomb_friction",
     title="dry friction",
     parameters=(
@@ -61,6 +78,22 @@ COULOMB_FRICTION = ElementLaw(
     confused_with=("damper_blowoff", "quadratic_damping", "bouc_wen", "clearance"),
     sentence="dry friction of {force}",
     corner=1,
+)
+# Sliding bearings: PTFE has a third of its friction at creeping rates (Constantinou, Mokha and Reinhorn 1990)
+COULOMB_FRICTION = with_wider_form(
+    _COULOMB,
+    ParameterSpec("slow_force", "N", 0.0, 1e9, "friction force at creeping rates", lambda s: _coulomb_shapes(s)[0, 0]),
+    ParameterSpec(
+        "rate", "m/s", 1e-6, 10.0, "rate over which it changes", lambda s: _TURNS * max(s.rate_rms, 1e-12), log=True
+    ),
+    force=_sliding,
+    formula="tanh(v / smoothing) * (force + (slow_force - force) * exp(-abs(v) / rate))",
+    shapes=lambda seen: np.array([_slow_forces(p, seen)[0] for p in _coulomb_shapes(seen).tolist()]),
+    absent=(0.0, 1.0, 0.0, 1.0),
+    sentence="dry friction of {force} that is {slow_force} at creeping rates and changes over {rate}",
+    prior_cost=RARE,
+    screened=False,
+    widened=_slow_forces,
 )
 
 

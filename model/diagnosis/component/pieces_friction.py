@@ -45,6 +45,13 @@ def _falls(fitted: FittedPiece) -> bool:
     return bool(shown.max() - force > fitted.rules.seen_to_fall * (static - force))
 
 
+def _rises(fitted: FittedPiece) -> bool:
+    """Whether friction was observed both at creeping rates and where it hardly changes any more."""
+    smoothing, rate = fitted.shape
+    fastest = float(np.max(np.abs(np.diff(fitted.deflection)))) / fitted.step
+    return smoothing < rate and 1 - np.exp(-fastest / rate) > fitted.rules.seen_to_fall
+
+
 def _slips(fitted: FittedPiece) -> bool:
     """Whether it slips at all; otherwise it is a spring with a gap."""
     gap, reach = fitted.shape
@@ -68,6 +75,19 @@ _COULOMB = Piece(
     kind=FRICTION,
     at_low_rates=DAMPER_BLOWOFF,
     yields_with_rate=True,
+)
+_SLIDING = Piece(
+    wider_form(COULOMB_FRICTION),
+    ("smoothing", "rate"),
+    lambda seen: grid(seen.rate_rms * np.geomspace(0.005, 0.1, 3), seen.rate_rms * np.geomspace(0.1, 1.0, 4)),
+    lambda seen: [(1e-3 * seen.rate_rms, 0.5 * seen.rate_rms), (0.02 * seen.rate_rms, 3.0 * seen.rate_rms)],
+    (1, 1),
+    lambda a, s, e: (a[0] + a[1], s[0], a[0], s[1]),
+    lambda p: (p[1], p[3]),
+    lambda a, s, e: {"breakaway_force": (a[0], "N")},
+    kind=FRICTION,
+    plain=1,
+    believed=_rises,
 )
 _STRIBECK = Piece(
     STRIBECK,
@@ -177,6 +197,7 @@ _BACKLASH = Piece(
 )
 
 FRICTION_PIECES: tuple[Piece, ...] = (
+    _SLIDING,
     _COULOMB,
     _STRIBECK,
     _DAHL,

@@ -20,8 +20,8 @@ import numpy as np
 from scipy.special import ndtr, stdtr
 
 from sprung.model.diagnosis.fit.baseline import refreshed
+from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
-from sprung.model.diagnosis.investigation.setup import misfit
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.response.terms import Term

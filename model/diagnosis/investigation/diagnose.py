@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.common_delay import common_delay
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
@@ -19,7 +20,7 @@ from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covari
 from sprung.model.diagnosis.investigation.named_laws import with_laws_together, with_named_laws
 from sprung.model.diagnosis.investigation.next_finding import next_finding
 from sprung.model.diagnosis.investigation.redundant import without_redundant
-from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
+from sprung.model.diagnosis.investigation.setup import fitted_samples, without_setup_faults
 from sprung.model.diagnosis.investigation.setup_effects import Hypothesis
 from sprung.model.diagnosis.investigation.significance import (
     shared_gain_covariance,

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
+from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.calibration import (
     calibrated,
@@ -18,7 +19,6 @@ from sprung.model.diagnosis.investigation.calibration import (
 from sprung.model.diagnosis.investigation.formula_trial import with_formula
 from sprung.model.diagnosis.investigation.masses import imitates_errors
 from sprung.model.diagnosis.investigation.minor import is_minor, sought, untried
-from sprung.model.diagnosis.investigation.setup import misfit
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.investigation.widened import (

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import baseline, refreshed
+from sprung.model.diagnosis.fit.misfit import misfit, total_misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation import setup_changes as changes
@@ -28,7 +29,7 @@ from sprung.model.diagnosis.investigation.setup_effects import (
 )
 from sprung.model.diagnosis.investigation.setup_hypotheses import hypotheses
 from sprung.model.diagnosis.investigation.setup_onset import begins_backwards, driving_point, velocity_of
-from sprung.model.diagnosis.investigation.setup_response import ModelResponse, relative
+from sprung.model.diagnosis.investigation.setup_response import ModelResponse
 from sprung.model.diagnosis.investigation.setup_scores import SetupScores
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
 from sprung.model.diagnosis.record.channels import DiagnosisError
@@ -124,20 +125,9 @@ def _misfit_with_missing_part(problem: Problem, fit: Fit, rival: float) -> float
     return total_misfit(leading)
 
 
-def total_misfit(fit: Fit) -> float:
-    """Misfit of all sensors together."""
-    return float(np.sum(misfit(fit)))
-
-
 def fitted_samples(whole: Signals, cut: Signals, split: int) -> int:
     """Number of fitted samples of signals that lost some at both ends."""
     return split - (whole.samples - cut.samples) // 2
-
-
-def misfit(fit: Fit) -> FloatArray:
-    """Misfit of every sensor, (S,)."""
-    part = fit.forward.part
-    return relative(fit.spectrum[part.grid.band][1:], part.sensors[part.grid.band][1:])
 
 
 @dataclass(frozen=True)

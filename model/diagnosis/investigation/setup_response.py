@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from sprung.model.diagnosis.fit.misfit import power
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
@@ -25,17 +26,6 @@ class Group:
 
 
 NOTHING = Group()
-
-
-def relative(error: ComplexArray, measured: ComplexArray) -> FloatArray:
-    """Misfit of every sensor, (S,), of errors (F, S)."""
-    return np.asarray(_power(error) / np.maximum(_power(measured), 1e-300))
-
-
-def _power(spectrum: ComplexArray) -> FloatArray:
-    """Sum of squares of every column, (S,)."""
-    parts = spectrum.real, spectrum.imag
-    return np.asarray(sum(np.einsum("fs,fs->s", part, part) for part in parts))
 
 
 @dataclass(frozen=True)
@@ -77,12 +67,12 @@ class ModelResponse:
 
     def misfit(self, predicted: ComplexArray) -> float:
         """Misfit of all sensors to a prediction."""
-        return float(np.sum(_power(self.measured - predicted) / self.size))
+        return float(np.sum(power(self.measured - predicted) / self.size))
 
     @cached_property
     def size(self) -> FloatArray:
         """Power of every sensor, (S,)."""
-        return np.maximum(_power(self.measured), 1e-300)
+        return np.maximum(power(self.measured), 1e-300)
 
     def turned(self, group: Group) -> ComplexArray:
         """Prediction if a group has the other sign."""

@@ -8,7 +8,6 @@ their values is part of the uncertainty.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,15 +15,14 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.state import Investigation, TriedWider, WidenedFit
-from sprung.model.diagnosis.record.spectra import OVERSAMPLING
-from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import WIDER, Term
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
-from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete
+from sprung.model.diagnosis.selection.along_measured import MeasuredMotion
+from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete, noise_bound
 from sprung.model.diagnosis.selection.evidence import occam_cost, profile_gain
 from sprung.model.diagnosis.selection.plausible import doubt
-from sprung.model.laws import ElementLaw, Observed, observe
+from sprung.model.diagnosis.selection.starts import wider_starts
+from sprung.model.laws import ElementLaw
 from sprung.model.signals import FloatArray
 
 _FIRST, _MORE, _ROUNDS = 3, 10, 3  # iterations of a start, and of the best one in a round; rounds while it falls
@@ -111,7 +109,7 @@ def with_wider_rivals(state: Investigation, trials: list[Trial]) -> list[Trial]:
     beside = [trial for trial in trials if trial.finished and trial.evidence > 0 and trial.term.location in taken]
     candidates: list[Candidate] = []
     for trial in beside:
-        starts = list(_starts(trial.fit, len(trial.fit.point.terms) - 1))
+        starts = list(wider_starts(trial.fit, len(trial.fit.point.terms) - 1))
         if starts and len({candidate.effect for candidate in candidates}) < state.options.rules.selection.wider:
             candidates += [replace(trial.candidate, term=start.terms[-1], start=start) for start in starts]
     if not candidates or state.problem.process_noise:
@@ -122,7 +120,12 @@ def with_wider_rivals(state: Investigation, trials: list[Trial]) -> list[Trial]:
 def _widened(state: Investigation, index: int) -> Fit | None:
     """The fit with one of its laws in its wider form, from the best of several starts."""
     problem, base = state.problem, state.fit
-    tried = (try_optimise(problem, start, _FIRST, base.whitener) for start in _starts(base, index))
+    starts = list(wider_starts(base, index))
+    if starts and base.reduced > noise_bound(problem, base):  # what it leaves is no noise: its motion may be far off
+        measured = MeasuredMotion.of(problem, base)
+        along = None if measured is None else measured.wider(index)
+        starts += [along] if along is not None else []
+    tried = (try_optimise(problem, start, _FIRST, base.whitener) for start in starts)
     best = min((fit for fit in tried if fit is not None), key=lambda fit: fit.chi_square, default=None)
     for _ in range(_ROUNDS):
         if best is None or best.converged:
@@ -151,33 +154,3 @@ def _cost(state: Investigation, fit: Fit, index: int) -> float:
     logs = [spec.log for spec in term.law.parameters[more]]
     rules = state.problem.rules.evidence
     return occam_cost(logs, term.scales[more], determined, rules) + rules.rarity * term.law.prior_cost
-
-
-def _starts(base: Fit, index: int) -> Iterator[Point]:
-    """Starts of the wider form of a term: from values of the element's other laws, and the law's own starts."""
-    term = base.point.terms[index]
-    law = term.law
-    wider = law.wider if isinstance(law, ElementLaw) else None
-    if wider is None or wider.widened is None:
-        return
-    seen = _seen(base, term)
-    scales = tuple(max(abs(spec.typical(seen)), 1e-12) for spec in wider.parameters)
-    known: dict[str, float] = {}
-    for other in base.point.terms:
-        if other.location == term.location and other is not term:
-            known |= zip(other.law.names, other.parameters, strict=True)
-    further = wider.names[len(term.parameters) :]
-    starts = [(*term.parameters, *(known[name] for name in further))] if known.keys() >= {*further} else []
-    for values in (*starts, *wider.widened(term.parameters, seen)):
-        clipped = tuple(float(value) for value in wider.clip(values))
-        moved = replace(term, law=wider, parameters=clipped, scales=scales, variant=WIDER, fixed=())
-        terms = (*base.point.terms[:index], moved, *base.point.terms[index + 1 :])
-        yield replace(base.point, terms=terms)
-
-
-def _seen(base: Fit, term: Term) -> Observed:
-    """The motion of a term's element."""
-    port, thin = term.port(base.forward.system), slice(None, None, OVERSAMPLING)
-    d, v = (motion[thin] @ port for motion in base.element_motion)
-    element = base.forward.element_of(term)
-    return observe(d, v, 1 / base.forward.part.grid.step, float(element.stiffness), float(element.damping))

@@ -57,6 +57,8 @@ def _balance_of(forward: Forward, state: FloatArray) -> HarmonicBalance:
 def _march(balance: HarmonicBalance, part: slice, begin: FloatArray) -> FloatArray:
     """Forces along a part of the oversampled axis, (4N', m), from an initial state (2n + b,)."""
     grid, s, d0, v0 = balance.grid, balance.plant.structure, balance.d0[part], balance.v0[part]
+    if not (np.isfinite(d0).all() and np.isfinite(v0).all()):
+        raise FloatingPointError("the motion without the laws' forces leaves the range of numbers")
     A, rows = s.state_matrix(), s.motion_rows(balance.wide)
     step = grid.step / _PARTS
     fine = grid.step / OVERSAMPLING * np.arange(len(d0))

@@ -12,12 +12,14 @@ import numpy as np
 
 from sprung.model.chunks import WORKERS, Piece, Result, share
 from sprung.model.diagnosis.fit.baseline import refreshed
+from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.rules import RULES, EvidenceRules, Rules, SelectionRules
 from sprung.model.diagnosis.screening.score import Candidate, Screening
+from sprung.model.diagnosis.selection.along_measured import MeasuredMotion
 from sprung.model.diagnosis.selection.evidence import (
     bic,
     chance,
@@ -131,9 +133,11 @@ def _initial_fits(problem: Problem, base: Fit, candidates: list[Candidate]) -> l
     screened = problem.rules.screening
     most = max((candidate.strength(screened) for candidate in candidates), default=0.0)
     again = problem.rules.selection.again * most
+    gross = float(np.sqrt(np.mean(misfit(base)))) > problem.rules.selection.gross
+    measured = MeasuredMotion.of(problem, base) if gross else None
 
     def initial_fit(own: Problem, candidate: Candidate) -> Trial | None:
-        return _initial_fit(own, base, candidate, candidate.strength(screened) > again)
+        return _initial_fit(own, base, candidate, candidate.strength(screened) > again, measured)
 
     def fits(chosen: list[Candidate]) -> list[Trial]:
         return [trial for trial in _in_parallel(initial_fit, problem, chosen) if trial is not None]
@@ -208,15 +212,19 @@ def runner_up(
     return None
 
 
-def _initial_fit(problem: Problem, base: Fit, candidate: Candidate, again: bool = False) -> Trial | None:
+def _initial_fit(
+    problem: Problem, base: Fit, candidate: Candidate, again: bool = False, measured: MeasuredMotion | None = None
+) -> Trial | None:
     """A few iterations of a candidate from each of its starts, and the best of these fits; None if all diverge.
 
     again: whether a law that has look-alikes among its own values is started from these too, if its first fits leave
-    more than noise.
+    more than noise.  measured: the model along the measured motion, for one more start.
     """
-    problem = replace(problem, newton_allowed=False)
+    exact, problem = problem, replace(problem, newton_allowed=False)
     starts = starts_of(problem, base, candidate)
     tried = [t for t in (_try(problem, base, candidate, start, 3) for start in starts) if t is not None]
+    along = [] if measured is None else measured.starts(candidate)
+    tried += [t for t in (_try(exact, base, candidate, start, 6) for start in along) if t is not None]
     best = max(tried, key=lambda t: t.evidence, default=None)
     if again and (best is None or _leaves_much(problem, best)):
         others = (_try(problem, base, candidate, start, 3) for start in alike_starts(base, candidate))
@@ -282,7 +290,7 @@ def _converged_fit(problem: Problem, base: Fit, trial: Trial) -> Trial:
 def _trial(problem: Problem, base: Fit, candidate: Candidate, fit: Fit, quiet: float | None = None) -> Trial:
     """A fit with its evidence over the base.  quiet: level below which blocks are no evidence; None: by the rules."""
     gain, reduction = _gain(problem, base, fit, problem.rules.evidence.quiet if quiet is None else quiet)
-    freedom = len(candidate.term.parameters) + len(fit.point.state) - len(base.point.state)
+    freedom = len(fit.point.terms[-1].parameters) + len(fit.point.state) - len(base.point.state)
     return Trial(candidate, fit, gain, reduction, gain - cost(fit, problem.rules.evidence), freedom)
 
 

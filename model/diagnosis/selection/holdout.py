@@ -23,6 +23,7 @@ from sprung.model.diagnosis.selection.evidence import process_gain
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
+_DIVERGED = 1e9  # samples of a run that leaves the range of numbers: worse than any that does not
 _ROUNDS = 4  # of laws' forces and the state at the start
 _SETTLED = 1e-4  # of the laws' forces
 _MARCHED = 2  # of them, in which time stepping replaces a harmonic balance that does not converge
@@ -118,7 +119,11 @@ class HeldOut:
     def _simulated(self, point: Point) -> tuple[FloatArray, Point]:
         """Held-out samples (T, S), and the point with its starting state."""
         if id(point) not in self._known:
-            self._known[id(point)] = point, self._simulate(point)
+            try:
+                simulated = self._simulate(point)
+            except (np.linalg.LinAlgError, FloatingPointError):
+                simulated = np.full_like(self.signals.sensors[self.split :], _DIVERGED), point
+            self._known[id(point)] = point, simulated
         return self._known[id(point)][1]
 
     def _simulate(self, point: Point) -> tuple[FloatArray, Point]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +11,11 @@ from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import opened
+from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point, advance, fixed
-from sprung.model.diagnosis.response.terms import Term, branches_of, evaluated_in_time
+from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
+from sprung.model.laws import BodyLaw, ElementLaw, Law, Observed, StructureLaw, observe
 from sprung.model.laws.base import FittedElement, Restart
 
 
@@ -174,3 +176,33 @@ def _void(term: Term) -> bool:
     if isinstance(term.law, StructureLaw):
         return not any(term.parameters[i] for i in term.law.strengths)
     return term.bounded
+
+
+def wider_starts(base: Fit, index: int) -> Iterator[Point]:
+    """Starts of the wider form of a term: from values of the element's other laws, and the law's own starts."""
+    term = base.point.terms[index]
+    law = term.law
+    wider = law.wider if isinstance(law, ElementLaw) else None
+    if wider is None or wider.widened is None:
+        return
+    seen = _seen(base, term)
+    scales = tuple(max(abs(spec.typical(seen)), 1e-12) for spec in wider.parameters)
+    known: dict[str, float] = {}
+    for other in base.point.terms:
+        if other.location == term.location and other is not term:
+            known |= zip(other.law.names, other.parameters, strict=True)
+    further = wider.names[len(term.parameters) :]
+    starts = [(*term.parameters, *(known[name] for name in further))] if known.keys() >= {*further} else []
+    for values in (*starts, *wider.widened(term.parameters, seen)):
+        clipped = tuple(float(value) for value in wider.clip(values))
+        moved = replace(term, law=wider, parameters=clipped, scales=scales, variant=WIDER, fixed=())
+        terms = (*base.point.terms[:index], moved, *base.point.terms[index + 1 :])
+        yield replace(base.point, terms=terms)
+
+
+def _seen(base: Fit, term: Term) -> Observed:
+    """The motion of a term's element."""
+    port, thin = term.port(base.forward.system), slice(None, None, OVERSAMPLING)
+    d, v = (motion[thin] @ port for motion in base.element_motion)
+    element = base.forward.element_of(term)
+    return observe(d, v, 1 / base.forward.part.grid.step, float(element.stiffness), float(element.damping))

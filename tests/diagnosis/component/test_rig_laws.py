@@ -90,6 +90,15 @@ def test_friction_whose_fall_is_not_identifiable_is_plain_friction_where_more_th
     assert found.steps[0].rivals[0].last.effect == "stribeck"
 
 
+def test_friction_of_a_sliding_bearing_rises_from_creeping_to_fast_sliding() -> None:
+    sliding = np.tanh(V / 1e-3) * (250.0 - 160.0 * np.exp(-np.abs(V) / 0.06))
+    report = diagnosed(K * D + 300.0 * V + sliding)
+    values = named(report, "coulomb_friction")
+    assert (values["force"], values["slow_force"]) == (pytest.approx(250, rel=0.05), pytest.approx(90, rel=0.05))
+    assert values["rate"] == pytest.approx(0.06, rel=0.1)
+    assert report.augmented_validation.nrmse < 2 * report.noise_floor.nrmse
+
+
 def test_presliding_is_dahls_with_its_force_and_stiffness() -> None:
     report = diagnosed(K * D + C * V + presliding(120.0, 2.4e5, 120.0, 1.0))
     values = named(report, "dahl")
