@@ -123,14 +123,111 @@ RARE = 12.0
 
 
 class Parametrised:
-    """What every law has: names of its parameters, and whether it admits values of them."""
+    """What is asked of every law; what only some kinds of laws have is absent here.
 
+    Simulation and diagnosis ask a law for what it does, and compare none with a particular one.
+    """
+
+    name: str
     parameters: tuple[ParameterSpec, ...]
+    absent: tuple[float, ...]
+    where: Where
     prior_cost: float = 0.0  # evidence by which the law must beat commoner ones
     named: bool = True  # whether it is physics with a name
     listed: bool = True  # False: defined only by its formula or the map of its force
     fault: bool = False  # whether it is one of the measurement, not of the system
     nuisance: bool = False  # reported, and no reason for any verdict
+    # Of some kinds of laws, where it is explained
+    strength: int | None = 0
+    memory: int = 0
+    memory_decay: Callable[[Values, SpringDamper], Any] | None = None
+    constant: bool = False
+    branch: Callable[[Values, float], Maxwell] | None = None
+    branches: Callable[[Values, SpringDamper], tuple[Maxwell, ...]] | None = None
+    formula: str = ""
+    memory_formula: str = ""
+    corner: int | None = None
+    knees: tuple[int, ...] = ()
+    wider: ElementLaw | None = None
+    load: Callable[[FloatArray, Values], FloatArray] | None = None
+    scales: str = ""
+    adds_motion: bool = False
+    holds: str = ""
+    response: Callable[[Values], SensorResponse] | None = None
+    of_instrument: Callable[[DataSheet], float] | None = None
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether its one value holds for all springs, or all bodies, of a system."""
+        return self.where in ("elements", "every body")
+
+    @property
+    def of_formula(self) -> bool:
+        """Whether it is defined by its formula only."""
+        return not self.listed and bool(self.formula)
+
+    @property
+    def in_time(self) -> bool:
+        """Whether its force is evaluated in time along the trajectory."""
+        return False
+
+    @property
+    def linear(self) -> bool:
+        """Whether a system with it is still a linear one, perhaps with one more force."""
+        return False
+
+    @property
+    def part(self) -> bool:
+        """Whether it is a linear structural part, many of which approximate any other structure.
+
+        Wrong values of the file are none, nor is damping of all springs or bodies.
+        """
+        return False
+
+    @property
+    def drives(self) -> bool:
+        """Whether it is an excitation of its own."""
+        return self.load is not None
+
+    @property
+    def error_of_value(self) -> bool:
+        """Whether it is an error of a value that the system file or a data sheet states, as every rig has some."""
+        return bool(self.scales)
+
+    @property
+    def delays(self) -> bool:
+        """Whether its only parameter is the delay of a channel, s."""
+        return False
+
+    @property
+    def frequency(self) -> int | None:
+        """The parameter that is its own frequency, Hz."""
+        return next((i for i, spec in enumerate(self.parameters) if spec.unit == "Hz"), None)
+
+    @property
+    def strengths(self) -> tuple[int, ...]:
+        """Parameters that scale its effect at constant shape; empty if there are none."""
+        return ()
+
+    @property
+    def told_apart_by(self) -> str:
+        """The experiment that would distinguish it from its look-alikes."""
+        return "a longer recording, or one at a higher level (worse track, more speed or load),"
+
+    def axis_in_words(self, variant: str) -> str:
+        """The axis that a variant of it stands for."""
+        return ""
+
+    def slope(self) -> SensorResponse:
+        """Derivative of its response by the first parameter, at none of the fault: what is no fault shows nothing."""
+        return SensorResponse(0.0, 0.0, 0.0, 0.0)
+
+    def scaled(self, p: Sequence[float], factor: float) -> FloatArray:
+        """Parameters at `factor` times the strength; not clipped."""
+        values = np.array(p, dtype=float)
+        for index in self.strengths:
+            values[index] = self.absent[index] + factor * (values[index] - self.absent[index])
+        return values
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -226,11 +323,29 @@ class ElementLaw(Parametrised):
     formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down
     memory_formula: str = ""  # the rate of its one state `z`, likewise
     parts: tuple[tuple[str, str], ...] = ()  # both of every part, where the force is a sum of such
+    constant: bool = False  # a force that no motion changes: in the model of every component test
 
     @property
-    def of_formula(self) -> bool:
-        """Whether it is defined by its formula only."""
-        return not self.listed and bool(self.formula)
+    def in_time(self) -> bool:
+        return self.branch is None
+
+    @property
+    def linear(self) -> bool:
+        return self.memory_decay is not None
+
+    @property
+    def part(self) -> bool:
+        return self.linear
+
+    @property
+    def strengths(self) -> tuple[int, ...]:
+        return () if self.strength is None or not self.named else (self.strength,)
+
+    @property
+    def told_apart_by(self) -> str:
+        if self.memory:
+            return "a recording at another speed, so that the same deflections come at other rates,"
+        return super().told_apart_by
 
     def clip(self, p: Sequence[float]) -> FloatArray:
         """Nearest admissible values, shape (P,)."""
@@ -277,6 +392,11 @@ class BodyLaw(Parametrised):
     powers: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     adds_motion: bool = False  # whether it brings a degree of freedom of its own
     prior_cost: float = 0.0
+    where: Where = "body"
+
+    @property
+    def linear(self) -> bool:
+        return True
 
 
 class Foothold(NamedTuple):
@@ -317,9 +437,15 @@ class StructureLaw(Parametrised):
     fault: bool = False
 
     @property
-    def everywhere(self) -> bool:
-        """Whether its one value holds for all springs, or all bodies, of a system."""
-        return self.where in ("elements", "every body")
+    def linear(self) -> bool:
+        return True
+
+    @property
+    def part(self) -> bool:
+        return not self.holds and not self.everywhere
+
+    def axis_in_words(self, variant: str) -> str:
+        return f", along {variant}" if variant else ""
 
 
 @dataclass(frozen=True)
@@ -339,6 +465,10 @@ class SupportLaw(Parametrised):
     sentence: str
     where: Where = "support"  # "axle": both supports of one axle together
     prior_cost: float = 0.0
+
+    @property
+    def drives(self) -> bool:
+        return True
 
     def movement(self, time: FloatArray, p: Values, highest: float = np.inf) -> tuple[FloatArray, FloatArray]:
         """What is added to the measured displacement (m) and velocity (m/s) at times on the laws' clock, each (T,).
@@ -403,6 +533,19 @@ class SensorLaw(Parametrised):
     fault: bool = True
     # Deviation of the only parameter in an instrument in order; None: no instrument has the fault
     of_instrument: Callable[[DataSheet], float] | None = None
+
+    @property
+    def error_of_value(self) -> bool:
+        return True
+
+    @property
+    def delays(self) -> bool:
+        alone = self.response is not None and len(self.parameters) == 1
+        return alone and self.slope() == SensorResponse(0.0, 0.0, 1.0, 0.0)
+
+    @property
+    def told_apart_by(self) -> str:
+        return "a calibration of the sensor"
 
     def distort(self, truth: FloatArray, p: Values, sample_rate: float) -> FloatArray:
         """What is shown of the truth (..., T) along the last axis."""

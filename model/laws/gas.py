@@ -33,6 +33,7 @@ PRELOAD = ElementLaw(
     sentence="a static preload of {force}",
     nuisance=True,
     screened=False,
+    constant=True,
 )
 
 

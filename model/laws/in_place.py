@@ -95,5 +95,5 @@ def _followers(file: SystemFile, placed: PlacedLaw, added: int) -> Iterator[Foll
         parameter = Parameter(name, placed.location, f"{law.name}.{spec.name}", spec.unit, value)
         if i in law.powers:
             yield Follower(parameter, added, *law.powers[i])
-        elif isinstance(law, BodyLaw) and law.scales == "mass":
+        elif law.scales:
             yield Follower(parameter, body=list(file.bodies).index(placed.location))

@@ -166,7 +166,7 @@ def _form(law: SensorLaw | ElementLaw, variant: str) -> SensorLaw | ElementLaw:
 
 def _as_wide_as(law: Law, numbers: Mapping[str, LawValue]) -> Law:
     """The wider form of a law where all of its parameters are given, else the law."""
-    wider = law.wider if isinstance(law, ElementLaw) else None
+    wider = law.wider
     return wider if wider is not None and set(numbers) == set(wider.names) else law
 
 
@@ -176,7 +176,7 @@ def _values(law: Law, numbers: Mapping[str, LawValue]) -> list[LawValue]:
         raise ValueError(
             f"{name} is no parameter of it; it has {', '.join(law.names) or 'none'}{did_you_mean(name, law.names)}"
         )
-    if isinstance(law, StructureLaw) and law.everywhere:  # what is not named is absent
+    if law.everywhere:  # what is not named is absent
         absent = zip(law.names, law.absent, strict=True)
         numbers = {name: LawValue(value=value, fixed=True) for name, value in absent} | {**numbers}
     for name in law.names:
@@ -202,7 +202,7 @@ def _location(file: SystemFile, law: Law, location: str, partner: str | None) ->
     """The place with its partner, for laws that act between two; all bodies of one that acts at all."""
     if isinstance(law, StructureLaw) and law.where == "every body" and partner is None:
         return "|".join(file.bodies)
-    where = "body" if isinstance(law, BodyLaw) else law.where
+    where = law.where
     if where not in ("pair", "axle", "bodies"):
         if partner is not None:
             raise ValueError("with: this law acts at one place")

@@ -12,7 +12,7 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from sprung.model.diagnosis.report.report import IdentifiedLaw, Report, ReportedParameter
 from sprung.model.diagnosis.response.terms import WIDER
-from sprung.model.laws import CATALOGUE, ElementLaw, Law, SensorLaw, StructureLaw
+from sprung.model.laws import CATALOGUE, Law, SensorLaw
 from sprung.model.system import System, parse_system
 
 _DIGITS = 6
@@ -73,7 +73,7 @@ def _write_noise(file: Any, report: Report) -> None:
 
 def _parameters(system: System, report: Report) -> tuple[ReportedParameter, ...]:
     """Values with the findings in place; without them where a law took over springs and no file has a place for it."""
-    names = {law.name for law in system.catalogue if isinstance(law, StructureLaw) and law.branches is not None}
+    names = {law.name for law in system.catalogue if law.branches is not None}
     return report.baseline if any(one.effect in names for one in report.findings) else report.augmented
 
 
@@ -125,7 +125,7 @@ def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> Non
     setting.update(_law_values(known, law, held))
     if law.variant and law.variant != WIDER:
         setting["variant"] = law.variant
-    if others and not (isinstance(known, StructureLaw) and known.everywhere):
+    if others and not (known is not None and known.everywhere):
         setting["with"] = others[0]
     setting.fa.set_flow_style()
     placed = CommentedMap({law.effect: setting})
@@ -135,10 +135,10 @@ def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> Non
 
 def _law_values(known: Law | None, law: IdentifiedLaw, held: set[str]) -> dict[str, CommentedMap]:
     """The values of a law's parameters as the file has them: with deviation, and whether they are fixed."""
-    corner = known.corner if isinstance(known, ElementLaw) else None
+    corner = None if known is None else known.corner
     values = {}
     for index, parameter in enumerate(law.parameters):
-        if isinstance(known, StructureLaw) and known.everywhere and parameter.value == parameter.std == 0:
+        if known is not None and known.everywhere and parameter.value == parameter.std == 0:
             continue  # a mode that the system does not have
         value = CommentedMap(value=_rounded(parameter.value))
         if parameter.std > 0:

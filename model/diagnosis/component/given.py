@@ -27,7 +27,7 @@ def given_model(
     """
     model, held = ComponentModel(), []
     for placed in system.laws:
-        if placed.location != element or (placed.law is PRELOAD and not all(placed.fixed)):  # part of every model
+        if placed.location != element or (placed.law.constant and not all(placed.fixed)):  # part of every model
             continue
         if all(placed.fixed) and isinstance(placed.law, ElementLaw):
             held.append(placed)

@@ -18,7 +18,7 @@ from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_sta
 from sprung.model.diagnosis.response.motion import Motions, motions_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import evaluated_in_time
-from sprung.model.laws import BodyLaw, SensorLaw
+from sprung.model.laws import SensorLaw
 from sprung.model.signals import FloatArray
 
 
@@ -169,11 +169,10 @@ def _add_terms(
     """Columns of the terms' parameters, without the reaction of the laws.
 
     Another mass gets its column in the same way as an estimated one: what masses, stiffnesses and dampings together
-    leave unchanged is not determined, however approximate the reaction of the laws is.  Beside an unmeasured force all
-    columns are taken along the smoothed motion, since the residual's covariance changes with the response, too.
+    leave unchanged is not determined, however approximate the reaction of the laws is.
     """
     at = P = len(point.theta)
-    pushed = forward if problem.process_noise else forward.with_part(problem.part)
+    pushed = forward.with_part(problem.driving(forward))
     for index, term in enumerate(point.terms):
         for j in range(len(term.parameters)):
             if forward.faulty_force(term) is not None:
@@ -182,7 +181,7 @@ def _add_terms(
                 if problem.process_noise:
                     change = forward.inputs_by_force_fault(term)[forward.part.grid.band]
                     known.log_det[at] = working.whitener.log_det_slope(change)
-            elif isinstance(term.law, BodyLaw) and term.law.scales:
+            elif term.law.scales:
                 known.loads[at] = inertial_load(forward, motions, term.location)
                 known.packed.add_load(at, known.loads[at])
                 if problem.process_noise:

@@ -90,6 +90,13 @@ class Problem:
             polynomial = polynomial + plant.polynomial_sensors(forces.motion, still, forces.line)
         return forward.shown(periodic, polynomial) + forward.of_body_loads()
 
+    def driving(self, forward: Forward) -> Part:
+        """The inputs along which faults of inputs act: measured ones; beside an unmeasured force those of the model.
+
+        The residual's covariance then changes with the response, too.
+        """
+        return forward.part if self.process_noise else self.part
+
     def shown_of_smoothed(self, forward: Forward, spectrum: ComplexArray) -> ComplexArray:
         """Shown sensor signals of the smoothed motion, (F, S), from the residual (F, S) under the measured inputs."""
         return self.smoothed(forward, self.part.sensors - spectrum)

@@ -31,7 +31,6 @@ from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.plausible import hardly_there, out_of_range
 from sprung.model.laws import Law, SensorLaw
 from sprung.model.laws.base import DataSheet
-from sprung.model.laws.bodies import MASS_CHANGE
 from sprung.model.schema import SupportInput
 from sprung.model.system import System
 
@@ -42,9 +41,9 @@ _TAILS, _REWEIGHTED = 4.0, 50  # degrees of freedom of Student's t, and iteratio
 
 def expected(system: System, signals: Signals, law: Law, location: str, rules: PlausibleRules) -> float:
     """Standard deviation of a parameter by the data sheet of its channel or body; 0: not a calibration error."""
-    if law is MASS_CHANGE:
-        mass = system.file.bodies[location].mass
-        return rules.weighed if mass.std is None else mass.std / mass.value
+    if law.scales:
+        stated = getattr(system.file.bodies[location], law.scales)
+        return rules.weighed if stated.std is None else float(stated.std / stated.value)
     names = [channel.name for channel in system.channels][-len(system.tolerances) :]
     if not isinstance(law, SensorLaw) or law.of_instrument is None or location not in names:
         return 0.0
@@ -82,7 +81,7 @@ def within_data_sheet(state: Investigation, term: Term) -> bool:
 def may_be_calibration(state: Investigation, term: Term) -> bool:
     """Whether a fault may be within a data sheet: a sensor is compared with an input, whose error it contains."""
     within = 2 * state.options.rules.plausible.calibration
-    return isinstance(term.law, SensorLaw) and _in_deviations(state, term) <= within
+    return term.law.of_instrument is not None and _in_deviations(state, term) <= within
 
 
 def _in_deviations(state: Investigation, term: Term) -> float:
@@ -154,7 +153,7 @@ def _scatter(errors: Sequence[_EstimatedError]) -> tuple[float, float]:
 
 def is_gain(term: Term) -> bool:
     """Whether a term is a gain that may be a calibration error."""
-    return isinstance(term.law, SensorLaw) and term.law.of_instrument is not None and term.law.slope().gain != 0
+    return term.law.of_instrument is not None and term.law.slope().gain != 0
 
 
 def shared_gain(terms: Sequence[Term]) -> tuple[float, float]:
@@ -256,7 +255,7 @@ def _freed_beyond_tolerance(state: Investigation, terms: Sequence[Term]) -> Iter
     for term in terms:
         if within_data_sheet(state, term):
             yield term
-        elif term.law is MASS_CHANGE:
+        elif term.law.scales:
             yield replace(term, known=(rules.masses,))
         elif term.location in sensors:
             yield replace(term, known=(rules.faulty * term.scales[0],))
@@ -266,7 +265,7 @@ def with_free_gains(state: Investigation, fit: Fit) -> Fit:
     """A fit with masses, and gains, zeros and delays of sensors free; those of the inputs stay fixed."""
     sensors, terms = state.signals.sensor_names, list(fit.point.terms)
     for index in calibration_indices(state):
-        if terms[index].location in sensors or terms[index].law is MASS_CHANGE:
+        if terms[index].location in sensors or terms[index].law.scales:
             terms[index] = replace(terms[index], fixed=())
     return replace(fit, point=replace(fit.point, terms=tuple(terms)))
 
@@ -303,19 +302,24 @@ def calibration_terms(state: Investigation) -> tuple[Term, ...]:
 
 
 def _of_all_bodies(state: Investigation) -> Iterator[Term]:
-    """Masses of bodies that the system file does not estimate, as found.
+    """Masses of bodies that the system file does not estimate, as found."""
+    laws = [law for law in state.problem.system.catalogue if law.scales]
+    return _freed_beyond_tolerance(state, [term for law in laws for term in _of_bodies(state, law)])
+
+
+def _of_bodies(state: Investigation, law: Law) -> Iterator[Term]:
+    """Changes of the quantity of bodies that a law scales, where the system file does not estimate it.
 
     Without a measured force, the heaviest body's is kept: masses are then known up to a common factor only.
     """
-    system = state.problem.system
-    known = {p.name.removesuffix(f".{MASS_CHANGE.scales}") for p in system.parameters}
-    known |= {term.location for term in state.fit.point.terms[: state.given] if term.law is MASS_CHANGE}
+    system, rules = state.problem.system, state.options.rules.plausible
+    known = {p.name.removesuffix(f".{law.scales}") for p in system.parameters}
+    known |= {term.location for term in state.fit.point.terms[: state.given] if term.law == law}
     if not _measures_force(system):
-        known.add(max(system.bodies, key=lambda name: system.file.bodies[name].mass.value))
-    free = (name for name in system.bodies if name not in known)
-    rules = state.options.rules.plausible
-    masses = [_as_found(state, MASS_CHANGE, n, expected(system, state.signals, MASS_CHANGE, n, rules)) for n in free]
-    return _freed_beyond_tolerance(state, masses)
+        known.add(max(system.bodies, key=lambda name: getattr(system.file.bodies[name], law.scales).value))
+    for name in system.bodies:
+        if name not in known:
+            yield _as_found(state, law, name, expected(system, state.signals, law, name, rules))
 
 
 def _as_found(state: Investigation, law: Law, location: str, spread: float) -> Term:

@@ -10,7 +10,6 @@ from sprung.model.diagnosis.investigation.calibration import faulty
 from sprung.model.diagnosis.investigation.setup_effects import NODE_DELAY, Hypothesis, SetupPlace
 from sprung.model.diagnosis.investigation.setup_hypotheses import Wiring
 from sprung.model.diagnosis.investigation.state import Investigation
-from sprung.model.laws.sensor_faults import SENSOR_LAG
 
 
 def common_delay(state: Investigation) -> Hypothesis | None:
@@ -18,7 +17,7 @@ def common_delay(state: Investigation) -> Hypothesis | None:
     names = list(state.signals.sensor_names)
     terms = state.fit.point.terms
     wrong = [*(terms[index] for index in faulty(state)), *terms[state.given :]]
-    late = {names.index(term.location): term.parameters[0] for term in wrong if term.law is SENSOR_LAG}
+    late = {names.index(term.location): term.parameters[0] for term in wrong if term.law.delays}
     if len(late) < 2:
         return None
     most = state.options.rules.setup.in_common / state.signals.sample_rate

@@ -24,7 +24,7 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
-from sprung.model.laws import ElementLaw, Law, StructureLaw
+from sprung.model.laws import Law
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
@@ -118,18 +118,7 @@ def leaves_more_than_noise(state: Investigation) -> bool:
 def changed_parts(state: Investigation) -> int:
     """Number of structural changes among the findings: moved elements and linear parts."""
     moved = sum(fault.effect is WRONG_BODY for fault in state.setup_faults)
-    return moved + sum(is_part(found.trial.term.law) for found in state.found)
-
-
-def is_part(law: Law) -> bool:
-    """Whether a law is a linear structural part: a connection, suspended mass, series spring, rubber.
-
-    Wrong values of the file are none, nor is damping of all springs or bodies.  Sums of such parts approximate any
-    other structure.
-    """
-    if isinstance(law, StructureLaw):
-        return not law.holds and not law.everywhere
-    return isinstance(law, ElementLaw) and law.memory_decay is not None
+    return moved + sum(found.trial.term.law.part for found in state.found)
 
 
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:

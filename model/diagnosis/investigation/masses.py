@@ -9,10 +9,7 @@ from __future__ import annotations
 
 from sprung.model.diagnosis.investigation.calibration import calibration_terms
 from sprung.model.diagnosis.investigation.state import Investigation
-from sprung.model.diagnosis.response.terms import evaluated_in_time
 from sprung.model.diagnosis.selection.compete import Trial, gain_together
-from sprung.model.laws import SensorLaw
-from sprung.model.laws.bodies import MASS_CHANGE
 
 _STEPS = 6  # of the fit of all errors, from the present model
 
@@ -23,8 +20,7 @@ def imitates_errors(state: Investigation, chosen: Trial) -> bool:
     These are not charged for what they are: they exist on every rig, only their sizes are unknown.
     """
     law = chosen.term.law
-    is_error = law is MASS_CHANGE or isinstance(law, SensorLaw)  # with it, all together always explain more
-    if state.calibrations is not None or evaluated_in_time(chosen.term) or is_error:
+    if state.calibrations is not None or law.in_time or law.error_of_value:  # with it, all together explain more
         return False
     found = {term.key for term in state.fit.point.terms}
     errors = [term for term in calibration_terms(state) if term.key not in found]

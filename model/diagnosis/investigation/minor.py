@@ -7,14 +7,13 @@ from collections.abc import Iterable
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
-from sprung.model.diagnosis.investigation.judgement import is_part
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.diagnosis.selection.plausible import harmonic
-from sprung.model.laws import COMPRESSION, EXTENSION, BodyLaw, ElementLaw, Law, StructureLaw
+from sprung.model.laws import COMPRESSION, EXTENSION, BodyLaw, Law, StructureLaw
 
 
 def untried(state: Investigation, candidates: Iterable[Candidate]) -> list[Candidate]:
@@ -70,8 +69,8 @@ def is_minor(state: Investigation, trial: Trial) -> bool:
     if _absorbed(state, trial):
         return True
     rules = state.options.rules.acceptance
-    even = (found.trial.gain for found in state.found if _is_everywhere(found.trial.term.law))
-    if is_part(trial.term.law) and trial.gain < rules.minor_beside * max(even, default=0.0):
+    even = (found.trial.gain for found in state.found if found.trial.term.law.everywhere)
+    if trial.term.law.part and trial.gain < rules.minor_beside * max(even, default=0.0):
         return True  # material damping varies over frequency more than its law
     for index, found in enumerate(state.found):
         if found.trial.term.location != trial.term.location:
@@ -103,10 +102,6 @@ def _is_minor_beside(state: Investigation, index: int, trial: Trial) -> bool:
     return alone and trial.reduction < rules.minor_beside * first and not _explains_most_of_the_rest(state, trial)
 
 
-def _is_everywhere(law: Law) -> bool:
-    return isinstance(law, StructureLaw) and law.everywhere
-
-
 def _explains_most_of_the_rest(state: Investigation, trial: Trial) -> bool:
     """Whether a trial explains most of the residual's power beyond the expected one of noise."""
     noise = state.fit.count - state.fit.jacobian.shape[1]
@@ -132,10 +127,7 @@ def _wald_statistic(fit: Fit, index: int, found: Law) -> float:
     term, place = fit.point.terms[index], fit.place(index)
     if not term.parameters:
         return 0.0
-    absent = np.zeros(len(term.parameters))
-    if isinstance(term.law, ElementLaw):
-        absent = np.where(np.isfinite(term.law.absent), term.law.absent, 0.0)
+    absent = np.where(np.isfinite(term.law.absent), term.law.absent, 0.0)
     variances = np.maximum(np.diag(fit.covariance)[place], 1e-300)
     statistics = np.subtract(term.parameters, absent) ** 2 / variances
-    strength = found.strength if isinstance(found, ElementLaw) else 0
-    return float(np.min(statistics) if strength is None else statistics[strength])
+    return float(np.min(statistics) if found.strength is None else statistics[found.strength])

@@ -14,7 +14,6 @@ from dataclasses import replace
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
 from sprung.model.diagnosis.selection.compete import cost, noise_bound
 from sprung.model.diagnosis.selection.evidence import profile_gain
-from sprung.model.laws import ElementLaw
 
 
 def with_named_laws(
@@ -63,8 +62,7 @@ def with_laws_together(state: Investigation, search: Callable[[Investigation], I
 
 
 def _is_formula(found: AcceptedFinding) -> bool:
-    law = found.trial.term.law
-    return isinstance(law, ElementLaw) and law.of_formula
+    return found.trial.term.law.of_formula
 
 
 def _explains_as_much(before: Investigation, unnamed: Investigation, named: Investigation) -> bool:

@@ -112,7 +112,7 @@ def _misfit_with_missing_part(problem: Problem, fit: Fit, rival: float) -> float
     best = sorted(candidates, key=lambda candidate: -candidate.score)[: rules.parts]
     starts = [start for candidate in best for start in structure_starts(problem, fit, candidate)]
     fits = [try_optimise(problem, start, rules.part_steps) for start in starts]
-    series = tuple(law for law in problem.system.catalogue if isinstance(law, ElementLaw) and law.memory_decay)
+    series = tuple(law for law in problem.system.catalogue if isinstance(law, ElementLaw) and law.linear)
     candidates = [candidate for candidate, _ in element_candidates(projector, series) if candidate.term.law in series]
     best = sorted(candidates, key=lambda candidate: -candidate.score)[: rules.parts]
     fits += [trial.fit for trial in compete(problem, fit, best)]

@@ -8,7 +8,7 @@ from sprung.model.diagnosis.investigation.calibration import calibration_indices
 from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import IdentifiedLaw
 from sprung.model.diagnosis.report.values import input_fault_parameter, law_parameters
-from sprung.model.laws import BodyLaw, Law
+from sprung.model.laws import Law
 
 _SHOWN = 4  # in the summary
 
@@ -37,7 +37,7 @@ def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
 
 def in_words(calibration: Sequence[IdentifiedLaw], catalogue: Sequence[Law]) -> str:
     """Summary; empty without calibration errors."""
-    quantities = {law.name: f"{law.scales} " for law in catalogue if isinstance(law, BodyLaw) and law.scales}
+    quantities = {law.name: f"{law.scales} " for law in catalogue if law.scales}
     if not calibration:
         return ""
     shown = [

@@ -23,7 +23,6 @@ from sprung.model.diagnosis.report.report import (
     Unexplained,
 )
 from sprung.model.diagnosis.report.values import deviations, figures, formula_of, law_parameters, reported_parameters
-from sprung.model.laws import StructureLaw
 
 
 def compose(outcome: Outcome, record: Recorded) -> Report:
@@ -85,9 +84,7 @@ def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[Ide
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
         moot = index in calibration_indices(state) and (term.location, term.law.name) not in reported
-        everywhere = (
-            isinstance(term.law, StructureLaw) and term.law.branches is not None
-        )  # cannot be expressed in a system file
+        everywhere = term.law.branches is not None  # cannot be expressed in a system file
         if term.law.named and not moot and not everywhere:
             values, texts = law_parameters(fit, index, state.options.rules.plausible), formula_of(term)
             found.append(IdentifiedLaw(term.location, term.law.name, values, term.variant, *texts))

@@ -15,7 +15,6 @@ from sprung.model.diagnosis.report.sentences import sentence_of
 from sprung.model.diagnosis.report.values import formula_of, input_fault_parameter, law_parameters
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ReportRules
-from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.system import System
@@ -114,7 +113,7 @@ def _look_alikes(found: AcceptedFinding, rules: ReportRules) -> tuple[str | None
     if not near:
         return None, None
     names = " or ".join([best.term.law.name, *dict.fromkeys(t.term.law.name for t in near)])
-    return names, f"{names} fit this recording almost equally well; {_experiment(best.term)} would tell them apart"
+    return names, f"{names} fit this recording almost equally well; {best.term.law.told_apart_by} would tell them apart"
 
 
 def _elsewhere(found: AcceptedFinding, rules: ReportRules) -> tuple[str, ...]:
@@ -136,14 +135,6 @@ def _beaten(found: AcceptedFinding) -> dict[str, float]:
         if rival.finished and name in best.term.law.confused_with:
             beaten[name] = min(margin, beaten.get(name, margin))
     return beaten
-
-
-def _experiment(term: Term) -> str:
-    if isinstance(term.law, ElementLaw) and term.law.memory:
-        return "a recording at another speed, so that the same deflections come at other rates,"
-    if isinstance(term.law, SensorLaw):
-        return "a calibration of the sensor"
-    return "a longer recording, or one at a higher level (worse track, more speed or load),"
 
 
 def _out_of_order(outcome: Outcome, index: int) -> tuple[float, Finding]:

@@ -85,7 +85,7 @@ def _of_element(state: Investigation, term: Term, key: str) -> dict[str, NDArray
         result.update(_formula_map(state, term, key, d, v))
     else:
         result[f"{key}.curve_law"] = drawn
-    if isinstance(term.law, ElementLaw) and term.law.memory and np.any(law):
+    if term.law.memory and np.any(law):
         part = slice(len(d) // 2, len(d) // 2 + int(3 / grid.step))
         result[f"{key}.loop_x"], result[f"{key}.loop_y"] = d[part], law[part]
     return result
@@ -113,7 +113,7 @@ def _surface(
 def _of_both(term: Term) -> bool:
     """Whether a term is a formula in both deflection and rate."""
     law = term.law
-    if not isinstance(law, ElementLaw) or not law.of_formula or law.memory:
+    if not law.of_formula or law.memory:
         return False
     return {"d", "v"} <= parse(law.formula, {*law.names, *MOTION}).names
 

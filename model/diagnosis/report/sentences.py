@@ -8,7 +8,6 @@ from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import Finding
 from sprung.model.diagnosis.report.values import deviations
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.laws import StructureLaw
 
 
 def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
@@ -18,8 +17,7 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
         words = _formula_in_words(finding) if finding.formula else term.law.sentence.format(**values)
     except (KeyError, IndexError):
         words = term.law.title
-    if isinstance(term.law, StructureLaw) and term.variant:
-        words += f", along {term.variant}"
+    words += term.law.axis_in_words(term.variant)
     if finding.family is not None:
         words = f"{finding.family.replace('_', ' ')}, which this recording cannot distinguish; as the first, {words}"
     if finding.elsewhere:

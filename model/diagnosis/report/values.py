@@ -105,7 +105,7 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
     A corner of width s is passed in steps of the rate, h each.  The slope there, sech^2(v / s), summed over samples
     instead of integrated is off by 2 x / sinh x cos(phase) of itself, x = pi^2 s / h (Poisson's sum formula).
     """
-    corner = term.law.corner if isinstance(term.law, ElementLaw) else None
+    corner = term.law.corner
     if corner is None or covariance[corner, corner] <= 0:
         return covariance
     rate = fit.element_motion[1] @ term.port(fit.forward.system)
@@ -122,4 +122,4 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
 def formula_of(term: Term) -> tuple[str, str]:
     """Formulas of the force and of its hidden state's rate; empty for laws of the catalogue."""
     law = term.law
-    return (law.formula, law.memory_formula) if isinstance(law, ElementLaw) and law.of_formula else ("", "")
+    return (law.formula, law.memory_formula) if law.of_formula else ("", "")

@@ -258,7 +258,7 @@ class Forward:
     def of_body_load(self, term: Term) -> ComplexArray:
         """Sensor signals of one unmeasured force on a body, (F, S)."""
         grid, law = self.part.grid, term.law
-        assert isinstance(law, BodyLaw) and law.load is not None
+        assert law.load is not None
         spectrum = grid.forward(law.load(grid.start + grid.time + CLOCK_LEAD, term.parameters))
         dof = self.system.mechanics.dofs.index(f"{term.location}.{term.variant}")
         return self.plant.sensor_of_load[:, :, dof] * spectrum[:, None] * self.sensor_factor
@@ -337,14 +337,11 @@ class Forward:
 
 def response_of(term: Term) -> SensorResponse | None:
     """Response of a faulty channel; None for terms that are not faults of a sensor."""
-    law = term.law
-    if not isinstance(law, SensorLaw) or law.response is None:
-        return None
-    return law.response(term.parameters)
+    return None if term.law.response is None else term.law.response(term.parameters)
 
 
 def _loads(term: Term) -> bool:
-    return isinstance(term.law, BodyLaw) and term.law.load is not None
+    return term.law.load is not None
 
 
 def _later(polynomial: FloatArray, delay: FloatArray) -> FloatArray:

@@ -119,7 +119,7 @@ def given_terms(system: System) -> tuple[Term, ...]:
 
 
 def _wider_forms(system: System) -> list[ElementLaw]:
-    return [law.wider for law in system.catalogue if isinstance(law, ElementLaw) and law.wider is not None]
+    return [law.wider for law in system.catalogue if law.wider is not None]
 
 
 def supports(system: System) -> list[str]:
@@ -134,9 +134,9 @@ def branches_of(term: Term, system: System, structure: Structure) -> tuple[Branc
     """
     law = term.law
     places = [system.elements.index(name) for name in term.location.split("|") if name in system.elements]
-    if isinstance(law, ElementLaw) and law.branch is not None:
+    if law.branch is not None:
         return tuple(Branch(e, *law.branch(term.parameters, float(structure.damping[e]))) for e in places)
-    if isinstance(law, StructureLaw) and law.branches is not None:
+    if law.branches is not None:
         of = [(e, SpringDamper(structure.stiffness[e], structure.damping[e])) for e in places]
         return tuple(Branch(e, *branch) for e, element in of for branch in law.branches(term.parameters, element))
     return ()
@@ -144,4 +144,4 @@ def branches_of(term: Term, system: System, structure: Structure) -> tuple[Branc
 
 def evaluated_in_time(term: Term) -> bool:
     """Whether the law's force is evaluated in time along the trajectory, by harmonic balance."""
-    return isinstance(term.law, ElementLaw) and term.law.branch is None
+    return term.law.in_time

@@ -64,8 +64,8 @@ def _of_sensors(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[C
 
 def _of_axles(projector: Projector, law: SensorLaw) -> Iterator[tuple[Candidate, int]]:
     """Both wheels of an axle wrong together, all that is measured of them: nothing redundant but the vehicle."""
-    part, grid = projector.problem.part, projector.grid
-    system = projector.problem.system
+    problem, grid = projector.problem, projector.grid
+    system, part = problem.system, problem.driving(projector.fit.forward)
     names = supports(system)
     factor = fault_factor(law.slope(), 1j * grid.omega[grid.band])
     for location in wheelsets(system):
@@ -81,7 +81,7 @@ def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Ca
     part, band = problem.part, grid.band
     names = [n for n, s in problem.system.file.inputs.items() if s.kind == "force"]
     plant = fit.forward.plant
-    pushed = fit.forward.part if problem.process_noise else part  # as in a fit's columns
+    pushed = problem.driving(fit.forward)
     for i, name in enumerate(names):
         if not np.any(part.force[:, i]):
             continue  # zero throughout: nobody measured it

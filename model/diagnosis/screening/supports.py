@@ -54,7 +54,7 @@ def _of_pairs(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Can
         share_d = precision_d / (precision_d + precision_v)
         integrated = noise.velocity[support] / np.maximum(omega, omega[1])
         level = np.hypot(noise.displacement[support], integrated)
-        periodic = part.support[band, support]
+        periodic = problem.driving(projector.fit.forward).support[band, support]
         shown = _pack(part.redundancy[band, at] / level, grid.weight)
         yield from _of_rate_offset(projector, laws, at)
         for channel, share, sign in (("displacement", share_d, -1.0), ("velocity", 1 - share_d, 1.0)):
@@ -92,7 +92,8 @@ def _of_fused(
     support = measured.support
     omega = grid.omega[grid.band]
     shares = measured.shares_at(np.maximum(omega, omega[1]))
-    periodic, G = problem.part.support[grid.band, support], projector.of_support[:, :, support]
+    driving, G = problem.driving(projector.fit.forward), projector.of_support[:, :, support]
+    periodic = driving.support[grid.band, support]
     name = supports(problem.system)[support]
     for order in measured.orders:
         shown, rate = measured.shown(order)

@@ -15,7 +15,7 @@ from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, PlausibleRules
-from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw, SupportLaw, reversal_step
+from sprung.model.laws import BodyLaw, reversal_step
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -28,23 +28,21 @@ def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, befo
     reason = out_of_range(term) or (displaced_spring(before, fit, term, rules) if before is not None else None)
     if reason is not None:
         return reason
-    if isinstance(term.law, ElementLaw) and term.law.corner is not None and _saturates(fit, term, rules):
+    if term.law.corner is not None and _saturates(fit, term, rules):
         return "its transition is as wide as the rates of the motion, which is a saturating damper"
-    if isinstance(term.law, ElementLaw) and term.law.knees:
+    if term.law.knees:
         return _unresolved(fit, term, rules)
-    if isinstance(term.law, (BodyLaw, StructureLaw)) and term.law.adds_motion:
+    if term.law.adds_motion:
         return _unheard(fit.forward.part.grid, term) or _too_slow(fit.forward.system, term, rules)
-    if isinstance(term.law, (BodyLaw, SupportLaw)):
-        return harmonic(fit.forward.part, term, rules)
-    return None
+    return harmonic(fit.forward.part, term, rules)
 
 
 def _unheard(grid: Grid, term: Term) -> str | None:
     """A resonance above the compared band; below it, it is indistinguishable from a heavier or softer body."""
-    if "frequency" not in term.law.names:
+    if term.law.frequency is None:
         return None
     highest = grid.omega[grid.band][-1] / (2 * np.pi)
-    frequency = term.parameters[term.law.names.index("frequency")]
+    frequency = term.parameters[term.law.frequency]
     return (
         f"{frequency:.3g} Hz is above the compared band, which ends at {highest:.3g} Hz"
         if frequency > highest
@@ -54,10 +52,10 @@ def _unheard(grid: Grid, term: Term) -> str | None:
 
 def _too_slow(system: System, term: Term, rules: PlausibleRules) -> str | None:
     """An elastic mode far below the modes of the suspension; above it, it is indistinguishable from a lighter body."""
-    if not isinstance(term.law, BodyLaw) or "frequency" not in term.law.names:
+    if not isinstance(term.law, BodyLaw) or term.law.frequency is None:
         return None
     slowest = slowest_mode(system, RULES.record.held)
-    frequency = term.parameters[term.law.names.index("frequency")]
+    frequency = term.parameters[term.law.frequency]
     if frequency >= rules.slow_mode * slowest:
         return None
     return f"{frequency:.3g} Hz is far below the slowest mode of the suspension, {slowest:.3g} Hz"
@@ -78,9 +76,7 @@ def displaced_spring(before: Fit, fit: Fit, term: Term, rules: PlausibleRules = 
 
     A law that yields or slips may replace a spring; a linear part leaves it the static load.
     """
-    law = term.law
-    linear = isinstance(law, (BodyLaw, StructureLaw)) or (isinstance(law, ElementLaw) and law.memory_decay is not None)
-    if not linear:
+    if not term.law.linear:
         return None
     most = np.log(rules.spring)
     for parameter, was, now in zip(fit.forward.system.parameters, before.point.theta, fit.point.theta, strict=True):
@@ -134,11 +130,9 @@ def _unresolved(fit: Fit, term: Term, rules: PlausibleRules) -> str | None:
 
 def harmonic(part: Part, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
     """A periodic force or movement at a multiple of one of the excitation's own frequencies."""
-    law, names = term.law, term.law.names
-    drives = isinstance(law, SupportLaw) or (isinstance(law, BodyLaw) and law.load is not None)
-    if "frequency" not in names or not drives:
+    if term.law.frequency is None or not term.law.drives:
         return None
-    frequency = term.parameters[names.index("frequency")]
+    frequency = term.parameters[term.law.frequency]
     for line in excitation_lines(part, rules):
         multiple = round(frequency / line)
         if (

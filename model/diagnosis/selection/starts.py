@@ -15,7 +15,7 @@ from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point, advance, fixed
 from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.laws import BodyLaw, ElementLaw, Law, Observed, StructureLaw, observe
+from sprung.model.laws import ElementLaw, Observed, StructureLaw, observe
 from sprung.model.laws.base import FittedElement, Restart
 
 
@@ -26,7 +26,7 @@ def starts_of(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
     if isinstance(candidate.term.law, StructureLaw):
         return structure_starts(problem, base, candidate)
     starts = [joint_start(problem, base, candidate), *_further_starts(problem, base, candidate)]
-    if _far_from_nominal(problem, base) and _strengths(candidate.term.law):  # parameters have absorbed a gross law
+    if _far_from_nominal(problem, base) and candidate.term.law.strengths:  # parameters have absorbed a gross law
         starts.append(joint_start(problem, base, candidate, nominal=True))
     return starts
 
@@ -42,7 +42,7 @@ def start_of(base: Fit, candidate: Candidate) -> Point:
     point = base.point
     state = point.state
     law = candidate.term.law
-    if isinstance(law, (BodyLaw, StructureLaw)) and law.adds_motion:  # a degree of freedom, last in q and in q'
+    if law.adds_motion:  # a degree of freedom, last in q and in q'
         n = (len(state) - len(base.forward.plant.structure.branches)) // 2
         state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
     more = branches_of(candidate.term, base.forward.system, base.forward.plant.structure)
@@ -139,7 +139,7 @@ def _joint_start(problem: Problem, base: Fit, candidate: Candidate, nominal: boo
     count = len(candidate.term.parameters)
     first = lin.jacobian.shape[1] - len(faint.state) - count
     kept = np.ones(lin.jacobian.shape[1], dtype=bool)
-    kept[first : first + count] = np.isin(np.arange(count), _strengths(candidate.term.law))
+    kept[first : first + count] = np.isin(np.arange(count), candidate.term.law.strengths)
     held = fixed(faint)
     kept[: len(held)] &= ~held
     columns = lin.jacobian[:, kept]
@@ -152,23 +152,9 @@ def _joint_start(problem: Problem, base: Fit, candidate: Candidate, nominal: boo
     return moved
 
 
-def _strengths(law: Law) -> tuple[int, ...]:
-    """Indices of the parameters that scale a law's effect at constant shape; empty if there are none."""
-    if isinstance(law, StructureLaw):
-        return law.strengths
-    if isinstance(law, ElementLaw) and law.strength is not None and law.named:
-        return (law.strength,)
-    return ()
-
-
 def _hint(term: Term, share: float) -> Term | None:
     """A term at a share of its strength; None if its law has no strength."""
-    law, strengths = term.law, _strengths(term.law)
-    if not strengths:
-        return None
-    if isinstance(law, ElementLaw):
-        return term.at(law.scaled(term.parameters, share))
-    return term.at(np.array([v * share if i in strengths else v for i, v in enumerate(term.parameters)]))
+    return term.at(term.law.scaled(term.parameters, share)) if term.law.strengths else None
 
 
 def _void(term: Term) -> bool:
@@ -182,7 +168,7 @@ def wider_starts(base: Fit, index: int) -> Iterator[Point]:
     """Starts of the wider form of a term: from values of the element's other laws, and the law's own starts."""
     term = base.point.terms[index]
     law = term.law
-    wider = law.wider if isinstance(law, ElementLaw) else None
+    wider = law.wider
     if wider is None or wider.widened is None:
         return
     seen = _seen(base, term)

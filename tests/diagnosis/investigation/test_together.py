@@ -22,7 +22,8 @@ def _found(law: object) -> Any:
     return SimpleNamespace(trial=SimpleNamespace(named=named, term=SimpleNamespace(law=law, element_law=law)))
 
 
-SURFACE, FORMULA = _found(None), _found(formula_law("a * d * abs(v)", "", ("a",)))
+SURFACE = _found(SimpleNamespace(named=False, of_formula=False))
+FORMULA = _found(formula_law("a * d * abs(v)", "", ("a",)))
 VALVE_AND_STOP = tuple(_found(find_law(name)) for name in ("damper_blowoff", "bump_stop"))
 
 
