@@ -6,10 +6,14 @@ import ast
 import re
 from collections import defaultdict
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from runpy import run_path
 
 import pytest
+
+from sprung.model.laws import CATALOGUE
+from sprung.model.laws.base import Parametrised
 
 ROOT = Path(__file__).parent.parent
 OURS = ("model", "replay", "service", "benchmarks")
@@ -350,3 +354,28 @@ def test_status_codes_of_http_are_given_in_one_folder() -> None:
 
 def test_the_shared_vocabulary_is_a_leaf() -> None:
     assert not any(name.split(".")[0] in OURS for name in imported(ROOT / "model" / "signals.py"))
+
+
+def _laws_imported(tree: ast.Module) -> set[str]:
+    """Names by which a file knows particular laws."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sprung.model.laws"):
+            module = import_module(node.module or "")
+            found |= {one.name for one in node.names if isinstance(getattr(module, one.name), Parametrised)}
+    return found
+
+
+@pytest.mark.parametrize("folder", ["model/diagnosis", "model/simulate"])
+def test_laws_are_asked_for_what_they_do_and_not_compared_with_particular_ones(folder: str) -> None:
+    """docs/decisions/0006-laws-carry-behaviour.md."""
+    listed, wrong = {law.name for law in CATALOGUE}, []
+    for path in modules(folder):
+        tree = ast.parse(path.read_bytes())
+        laws = _laws_imported(tree)
+        for node in (one for one in ast.walk(tree) if isinstance(one, ast.Compare)):
+            parts = [part for side in (node.left, *node.comparators) for part in ast.walk(side)]
+            named = {part.id for part in parts if isinstance(part, ast.Name)} & laws
+            said = {part.value for part in parts if isinstance(part, ast.Constant)} & listed
+            wrong += [f"{path.relative_to(ROOT).as_posix()}:{node.lineno} {one}" for one in (*named, *said)]
+    assert wrong == []

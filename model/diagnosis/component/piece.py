@@ -115,6 +115,7 @@ class Piece:
     imitates: bool = False  # so flexible that it must leave as little as several laws
     at_low_rates: ElementLaw | None = None  # law that it is equivalent to at low rates
     yields_with_rate: bool = False  # a yield force above a rate, with a steep slope below it
+    strengthened: bool = False  # whether its strength may follow a signal: by a valve, a temperature
 
     @property
     def dissipates(self) -> bool:

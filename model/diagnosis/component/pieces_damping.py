@@ -37,7 +37,16 @@ def _opens_late_enough(fitted: FittedPiece) -> bool:
     return all(least <= r < most for r in ratios) and all(k > fitted.corner for k in knees)
 
 
-_QUADRATIC = Piece(QUADRATIC_DAMPING, (), no_shapes, lambda seen: [], (1,), lambda a, s, e: (a[0],), lambda p: ())
+_QUADRATIC = Piece(
+    QUADRATIC_DAMPING,
+    (),
+    no_shapes,
+    lambda seen: [],
+    (1,),
+    lambda a, s, e: (a[0],),
+    lambda p: (),
+    strengthened=True,
+)
 _BLOWOFF = Piece(
     DAMPER_BLOWOFF,
     ("knee",),

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 from sprung.model.diagnosis.component.piece import Following, LawPiece, Piece, no_shapes
 from sprung.model.diagnosis.component.pieces import PIECES
-from sprung.model.laws.damping import COULOMB_FRICTION, QUADRATIC_DAMPING
 from sprung.model.laws.following import Covariate, following_law
-from sprung.model.laws.hysteresis import BOUC_WEN
-from sprung.model.laws.lost_motion import FRICTION_BACKLASH
-
-_STRENGTHENED = (COULOMB_FRICTION, BOUC_WEN, FRICTION_BACKLASH.wider, QUADRATIC_DAMPING)  # by a valve or a temperature
 
 
 def pieces_following(signal: Covariate) -> tuple[LawPiece, ...]:
@@ -29,5 +24,5 @@ def pieces_following(signal: Covariate) -> tuple[LawPiece, ...]:
     return (
         linear("stiffness"),
         linear("damping"),
-        *(Following(piece, signal) for piece in PIECES if piece.law in _STRENGTHENED),
+        *(Following(piece, signal) for piece in PIECES if piece.strengthened),
     )

@@ -75,6 +75,7 @@ _COULOMB = Piece(
     kind=FRICTION,
     at_low_rates=DAMPER_BLOWOFF,
     yields_with_rate=True,
+    strengthened=True,
 )
 _SLIDING = Piece(
     wider_form(COULOMB_FRICTION),
@@ -152,6 +153,7 @@ _BOUC_WEN = Piece(
     _loop_shape,
     _yield_words,
     kind=HYSTERESIS,
+    strengthened=True,
 )
 _FREE_BOUC_WEN = Piece(
     wider_form(BOUC_WEN),
@@ -194,6 +196,7 @@ _BACKLASH = Piece(
     lambda a, s, e: {"slip_force": (a[0] + a[1], "N"), "lost_motion": (s[0], "m")},
     kind=HYSTERESIS,
     believed=_slips,
+    strengthened=True,
 )
 
 FRICTION_PIECES: tuple[Piece, ...] = (

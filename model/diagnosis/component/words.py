@@ -23,12 +23,9 @@ from sprung.model.signals import FloatArray
 _DATA_SHEET_RATES = (0.05, 0.1, 0.2, 0.3, 0.52, 1.0, 1.5)  # m/s, at which damper makers quote forces
 _MIDDLE = 0.3  # of the travel, central part for dynamometer forces
 _FEWEST = 5  # samples for a force
-_BAND = 0.8  # of the residual's power, in the band that is told
+_BAND = 0.8  # of the residual's power, in the band that is reported
 _NEAR_RATE = 0.05  # relative distance of a sample's rate
 
-_SPOKEN = frozenset(
-    {"yield_force", "yield_displacement", "slip_force", "lost_motion", "breakaway_force", "force_at_knee"}
-)
 _TO_DISTINGUISH = (
     "a test at other amplitudes and other rates, so that the same deflections come at other rates, "
     "would tell them apart"
@@ -47,6 +44,7 @@ def finding_of(
     """The finding of one law; alike: names of its look-alikes."""
     piece = fit.model.pieces[index]
     values, quoted = _parameters(fit.values(index), sigma[0]), _parameters(fit.quoted(index), sigma[1])
+    shown = quoted or values[:2]
     if piece.dissipates:
         quoted += (_loop_area(fit),)
     quoted += _forces_at_rates(fit)
@@ -54,7 +52,6 @@ def finding_of(
     rival = step.rivals[0] if step.rivals else None
     formula, memory = (piece.law.formula, piece.law.memory_formula) if isinstance(piece, FormulaPiece) else ("", "")
     what = f"a force {formula}" if formula else piece.title
-    shown = [one for one in quoted if one.name in _SPOKEN] or list(values[:2])
     sentence = _sentence(f"{element}: {what}", shown[:3], memory, family)
     if base.element.damping > 0 and fit.element.damping * fit.task.rules.no_longer < base.element.damping:
         sentence += f"; {element}.damping is then no longer needed"
