@@ -71,6 +71,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "sprung.benchmarks.sensitivity",
         "what a diagnosis says when one of its deciding numbers is another",
     ),
+    "tracking-rules": (
+        "sprung.benchmarks.tracking_rules",
+        "what a tracker says when one of its deciding numbers is another",
+    ),
     "emps": ("sprung.benchmarks.emps", "missing physics in the EMPS record (--data DIR)"),
     "paper": ("sprung.benchmarks.paper", "the paper's systems, baselines and ablations"),
     "paper-cells": ("sprung.benchmarks.rerun_paper", "random figures of docs/paper.md, made again"),

@@ -25,7 +25,7 @@ from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System, load_system
-from sprung.model.tracking import changes, inflation, misfit
+from sprung.model.tracking import changes, inflation
 from sprung.model.tracking.settings import SECONDS_PER_MONTH
 from sprung.model.tracking.tracker import Tracker, TrackerSettings
 from sprung.service.errors import UserError
@@ -179,7 +179,9 @@ def false_alarms(covariances: FloatArray, months: float, rng: np.random.Generato
         opened = (state.active != 0) & (quiet == 0)
         alarms += int(np.count_nonzero(opened))
         quiet = state.active
-        contradictions += int(np.count_nonzero(fleet.inflation.square.max(axis=1) >= misfit.CONTRADICTION))
+        contradictions += int(
+            np.count_nonzero(fleet.inflation.square.max(axis=1) >= settings.rules.misfit.contradiction)
+        )
         now = np.maximum(state.up, state.down)
         for i, level in enumerate(NOISE_LEVELS * evidence):
             crossings[i] += np.count_nonzero((now >= level) & (highest < level))

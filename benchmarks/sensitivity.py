@@ -34,6 +34,7 @@ from sprung.model.diagnosis.investigation.judgement import judged
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.rules import RULES, Rules, reason
+from sprung.model.rule import RuleTable
 from sprung.model.system import System
 
 ALONE = {  # stages of recordings of their own, with what decides there
@@ -141,7 +142,7 @@ def run(
     yield from lines
     if write is not None:
         before = json.loads(write.read_text(encoding="utf-8")) if write.exists() else {}
-        write.write_text(quoted(lines, done, budget, before), encoding="utf-8")
+        write.write_text(quoted(lines, done, f"recordings ({budget})", before), encoding="utf-8")
     yield {
         "numbers": len(lines),
         "that_change_something": sum(bool(line["changed"]) for line in lines),
@@ -215,16 +216,21 @@ def figure(stage: str, number: Field[Any], done: list[dict[str, Any]]) -> dict[s
 
 
 def quoted(
-    lines: list[dict[str, Any]], done: list[dict[str, Any]], budget: str, before: dict[str, Any] | None = None
+    lines: list[dict[str, Any]],
+    done: list[dict[str, Any]],
+    subjects: str,
+    before: dict[str, Any] | None = None,
+    rules: RuleTable = RULES,
 ) -> str:
     """What the reasons of the rules say of a run, as JSON of a line per number: what is said otherwise at which end.
 
-    before: what was known.  A number that is what it was, and was varied on more recordings then, keeps that, and so
+    subjects: what they are, in words; before: what was known.  A number that is what it was, and was varied on more
+    recordings then, keeps that, and so
     do numbers that this run did not vary.  The set that is named is the larger one.
     """
     before = before or {"recordings": [], "numbers": {}}
     known_of, smaller = before["numbers"], len(done) < len(before["recordings"])
-    others = {f"{n}.{one.name}" for n, one in RULES.constants()} - {
+    others = {f"{n}.{one.name}" for n, one in rules.constants()} - {
         f"{line['stage']}.{line['number']}" for line in lines
     }
     numbers = {name: found for name, found in known_of.items() if name in others} | {
@@ -244,7 +250,7 @@ def quoted(
             continue
         if known["varied"] == [line["value"], *line["range"]]:
             numbers[name] = known
-    head = {"set": f"{len(done)} recordings ({budget})", "recordings": [one["recording"] for one in done]}
+    head = {"set": f"{len(done)} {subjects}", "recordings": [one["recording"] for one in done]}
     if smaller:
         head = {key: before[key] for key in head}
     rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(found)}" for name, found in numbers.items())

@@ -10,29 +10,20 @@ varies every one over its range and prints what changes.  Its latest results are
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import Field, dataclass, fields, replace
+from dataclasses import Field, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from sprung.model.ambient.rules import WINDOW_RULES, AmbientWindowRules
-from sprung.model.rule import rule
+from sprung.model.rule import RuleTable, reason_of, rule
 
 VARIED = Path(__file__).with_name("varied.json")  # made by `sprung bench sensitivity --write`
 
 
 def reason(stage: str, number: Field[Any]) -> str:
     """Reason for a number's value, and the result of the sensitivity bench for other values."""
-    found = _varied()["numbers"].get(f"{stage}.{number.name}")
-    low, high = number.metadata["range"]
-    if found is None or found["varied"] != [number.default, low, high]:
-        return f"{number.metadata['reason']}; not varied as it is now"
-    where = "; ".join(found.get("on", [f"{found['recordings']} of {_varied()['set']}"]))
-    effect = f"insensitive from {low:g} to {high:g}"
-    if found["changes"]:
-        effect = f"changes {'; '.join(found['changes'])}"
-    return f"{number.metadata['reason']}; on {where} {effect}"
+    return reason_of(stage, number, _varied())
 
 
 @cache
@@ -150,6 +141,12 @@ class ScreeningRules:
         0.05, "median damping ratio up to which modes may have their own; chosen: buildings, frames, wings", 0.03, 0.07
     )
     mass_damping: float = rule(0.05, "the same of trial masses; chosen: equipment on rubber", 0.025, 0.1)
+    # Sizes of values, by which their priors are wide; of others, their laws state it, or it is the value found
+    phase: float = rule(1.0, "rad, of a force; derived: it may have any", 0.5, 3.0)
+    turn: float = rule(0.1, "periods, of a dip; chosen: a tenth of a turn", 0.05, 0.3)
+    place: float = rule(1.0, "m, of a part; chosen: vehicles and rigs", 0.5, 2.0)
+    modal: float = rule(0.01, "damping ratio of a mode; chosen: buildings, frames, wings", 0.005, 0.02)
+    power: float = rule(0.1, "power of the frequency, of a loss factor; chosen: rubber", 0.05, 0.2)
 
 
 @dataclass(frozen=True)
@@ -378,6 +375,7 @@ class ReportRules:
     scale: float = rule(3.0, "ratio of sizes; chosen: no parameter explains it", 2.0, 5.0)
     far: float = rule(1.6, "log-ratio to nominal; chosen: a factor of 5, no rebuilt vehicle is as far off", 1.1, 2.3)
     stretches: int = rule(20, "of the spectrum, with misfits of their own; derived: a covariance needs some", 10, 40)
+    bias: float = rule(0.01, "log-ratio by which a parameter was misread, that is reported; chosen", 0.005, 0.03)
     loose: float = rule(0.2, "standard deviation of a log-ratio of an undecided parameter; chosen", 0.1, 0.4)
 
 
@@ -480,10 +478,13 @@ class AmbientRules:
     windows_track: int = rule(8, "of a vehicle on an unmeasured track; chosen", 5, 16)
     independent: int = rule(3, "windows for a scatter; derived: two have one difference", 3, 5)
     parts: int = rule(40, "of the band, in which powers are compared; chosen", 25, 60)
+    followed: float = rule(
+        0.1, "of the lowest frequency, deviation of a window that shows its range; chosen", 0.05, 0.2
+    )
 
 
 @dataclass(frozen=True)
-class Rules:
+class Rules(RuleTable):
     """The rules of every stage, in the order in which they decide."""
 
     record: RecordRules = RecordRules()
@@ -502,16 +503,6 @@ class Rules:
     component: ComponentRules = ComponentRules()
     ambient: AmbientRules = AmbientRules()
     ambient_window: AmbientWindowRules = WINDOW_RULES
-
-    def constants(self) -> Iterator[tuple[str, Field[Any]]]:
-        """Every number as the stage's name and its field."""
-        for stage in fields(self):
-            for one in fields(getattr(self, stage.name)):
-                yield stage.name, one
-
-    def varied(self, stage: str, name: str, value: Any) -> Rules:
-        """The same with one number changed."""
-        return replace(self, **{stage: replace(getattr(self, stage), **{name: value})})
 
 
 RULES = Rules()

@@ -24,20 +24,11 @@ from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.deviation_model import DeviationModel
 from sprung.model.tracking.deviations import Jump
+from sprung.model.tracking.rules import AlarmRules
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
 from sprung.model.tracking.weather import WeatherModel
 
-CERTAIN = 2.5  # standard deviations within which two explanations are equally good
-LARGEST = {"gain": 0.3, "delay": 0.03}  # larger deviations are not considered as explanations
-PATIENCE = 20.0  # s that an alarm waits for windows with information on deviations
-ALIKE = 0.35  # of the common change: elements within this of it change together
-MOST_OF = 0.75  # of the elements of a kind
-FEWEST = 4  # elements whose changes can be compared with a common one
-RECOVERED = 0.6  # of the change that opens an alarm of a kind: below, the alarm is closed
-SENSOR_RECOVERED = 0.2  # of a sensor's largest deviation: below with certainty, its alarm is closed
-LOAD_KNOWN = 0.02  # standard deviation of a load from which on it is compared with its limits
-HARD_FAULT_WINDOWS = 6  # windows after which a frozen or reversed channel is reported
 HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped")
 
 
@@ -79,6 +70,10 @@ class Attribution:
     masses: Mapping[str, tuple[str, ...]]  # bodies whose mass is not identifiable, and the elements at them
 
     @property
+    def _rules(self) -> AlarmRules:
+        return self.settings.rules.alarms
+
+    @property
     def kinds(self) -> list[str]:
         """Quantity of each parameter: "stiffness", "damping"."""
         return [name.rpartition(".")[2] for name in self.names]
@@ -89,7 +84,7 @@ class Attribution:
         if jump is None and not (common or overloads or drifted) and _nothing_is_wrong(state):
             return state.alarms
         alarms = [self._present(alarm, state, drift, now) for alarm in state.alarms]
-        if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= dev.JUMP_LIMIT[jump.kind]:
+        if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= self.model.jump_limit(jump.kind):
             alarms = self._with_sensor(alarms, jump, now)
         alarms = self._with_drifted(alarms, drifted, state, now)
         alarms = self._with_stuck(alarms, state, now)
@@ -119,9 +114,9 @@ class Attribution:
         members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
         if np.isnan(drift.whole[members]).all():  # all baselines are learned anew: there is nothing to compare with
             return _closed(alarm, now)
-        still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, RECOVERED))
+        still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, self._rules.recovered))
         change, std = _common(replace(drift, change=drift.whole), members)
-        moved = state.changes.active[members].any() and abs(change) > RECOVERED * self._common_limit
+        moved = state.changes.active[members].any() and abs(change) > self._rules.recovered * self._common_limit
         if not (still or moved):  # a change of one element alone does not keep the alarm of all open
             return _closed(alarm, now)
         return self._updated(alarm, change, std)
@@ -179,9 +174,10 @@ class Attribution:
             out.append(self._updated(alarm, change, std))
         return out
 
-    def _overloads(self, state: TrackerState, certain: float = CERTAIN) -> dict[str, tuple[float, float]]:
+    def _overloads(self, state: TrackerState, certain: float | None = None) -> dict[str, tuple[float, float]]:
         """Bodies whose load is beyond its limits: excess relative to the empty mass, and its standard deviation."""
         found = {}
+        certain = self._rules.certain if certain is None else certain
         H = len(self.deviations)
         for h, deviation in enumerate(self.deviations):
             limit = self.limits.get(deviation.name) if deviation.kind == "load" else None
@@ -189,7 +185,7 @@ class Attribution:
                 continue
             value, std = float(state.belief.mean[-H:][h]), float(np.sqrt(state.belief.covariance.diagonal()[-H:][h]))
             excess = limit.beyond(value) / limit.empty
-            if std < LOAD_KNOWN and abs(excess) > certain * std * np.exp(value):
+            if std < self._rules.load_known and abs(excess) > certain * std * np.exp(value):
                 found[deviation.name] = (excess, std * float(np.exp(value)))
         return found
 
@@ -254,16 +250,16 @@ class Attribution:
     def _all_changed(self, drift: Drift, members: IntArray) -> bool:
         """Whether most of `members` have changed alike, and significantly."""
         known = members[np.isfinite(drift.change[members])]
-        if len(known) < FEWEST:
+        if len(known) < self._rules.fewest:
             return False
         middle, std = _common(drift, known)
         with_it = np.array([self._changed_with(i, drift, known) for i in known])
-        return bool(with_it.mean() >= MOST_OF and abs(middle) > max(self._common_limit, 4 * std))
+        return bool(with_it.mean() >= self._rules.most_of and abs(middle) > max(self._common_limit, 4 * std))
 
     @property
     def _common_limit(self) -> float:
         """Common change that opens an alarm of a kind; a median is more precise than one element."""
-        return self.settings.change / 4
+        return self.settings.change * self._rules.common
 
     def _masses_of(self, changed: Sequence[int], drift: Drift) -> tuple[str, ...]:
         """Masses that explain the changes of `changed`, too: all springs and dampers at the body changed alike."""
@@ -277,7 +273,7 @@ class Attribution:
     def _changed_with(self, i: int, drift: Drift, members: IntArray) -> bool:
         middle, std = _common(drift, members)
         distance = abs(drift.change[i] - middle)
-        return bool(distance < max(ALIKE * abs(middle), 3 * float(np.hypot(drift.std[i], std))))
+        return bool(distance < max(self._rules.alike * abs(middle), 3 * float(np.hypot(drift.std[i], std))))
 
     def _alternatives(self, i: int, state: TrackerState, drift: Drift, since: int, now: int) -> tuple[str, ...] | None:
         """Deviations that explain the change of parameter `i` equally well; None: not decided yet.
@@ -289,22 +285,23 @@ class Attribution:
         calibration = state.calibration
         if calibration.recent[-1] == 0:  # estimates without information on deviations
             return ()
-        undecided = calibration.recent[0] < since or calibration.ratio.max(initial=0.0) >= dev.SUSPECTED
-        if undecided and (now - since) * 1e-9 < PATIENCE:
+        undecided = calibration.recent[0] < since or calibration.ratio.max(initial=0.0) >= self.model.rules.suspected
+        if undecided and (now - since) * 1e-9 < self._rules.patience:
             return None
         moved = np.log1p(drift.change[i])
+        largest = {"gain": self._rules.largest_gain, "delay": self._rules.largest_delay}
         found = []
         for h, deviation in enumerate(self.deviations):
             slope = calibration.cross[i, h]
-            if deviation.kind not in LARGEST or calibration.curvature[h] <= 0 or slope == 0:
+            if deviation.kind not in largest or calibration.curvature[h] <= 0 or slope == 0:
                 continue
             needed = moved / -slope  # deviation that shifts the estimate by this much
             std = calibration.curvature[h] ** -0.5
             seen = calibration.slope[h] / calibration.curvature[h]
             if (
-                abs(needed) <= LARGEST[deviation.kind]
-                and abs(needed) < CERTAIN * std
-                and abs(seen - needed) < CERTAIN * std
+                abs(needed) <= largest[deviation.kind]
+                and abs(needed) < self._rules.certain * std
+                and abs(seen - needed) < self._rules.certain * std
             ):
                 found.append((abs(needed) / deviation.std, f"{deviation.name}.{deviation.kind}"))
         return tuple(name for _, name in sorted(found)[:3])
@@ -359,13 +356,14 @@ class Attribution:
         off = float(np.mean((away - self.model.common_value(away, others))[members]))
         own = self.model.relative_std(state.belief.covariance[-H:, -H:])[members]
         # The reference is as uncertain as the present value, or wrong by a drift that is not detected yet.
-        undetected = dev.DRIFT_SHARE / 3 * self.model.drift_limit[members]
+        undetected = self.model.rules.drifted / 3 * self.model.drift_limit[members]
         of_reference = np.where(state.calibration.moved[members] > 0, own, undetected)
         known = float(np.sqrt(np.mean(own**2)))
         spread = float(np.mean(own**2 + of_reference**2 + dev.pending_variance(state.calibration, self.model)[members]))
         linear = float(dev.linearisation_std(np.asarray(off))) if kind == "gain" else 0.0
         std = float(np.hypot(np.sqrt(spread), linear))
-        if abs(off) + 2 * known < max(dev.JUMP_LIMIT[kind], SENSOR_RECOVERED * abs(alarm.peak or 0.0)):
+        recovered = self._rules.sensor_recovered * abs(alarm.peak or 0.0)
+        if abs(off) + 2 * known < max(self.model.jump_limit(kind), recovered):
             return _closed(replace(alarm, change=off, std=std), now)
         peak = off if abs(off) > abs(alarm.peak or 0.0) else alarm.peak
         return replace(alarm, change=off, std=std, peak=peak)
@@ -375,7 +373,7 @@ class Attribution:
         return alarms + [
             Alarm("sensor", f"{s.channel}.{s.kind}", s.since, now, "warning", s.value)
             for s in state.stuck
-            if s.count >= HARD_FAULT_WINDOWS and f"{s.channel}.{s.kind}" not in opened
+            if s.count >= self._rules.hard and f"{s.channel}.{s.kind}" not in opened
         ]
 
     def _updated(self, alarm: Alarm, change: float, std: float) -> Alarm:
@@ -422,7 +420,9 @@ def _between(change: float, common: float) -> bool:
     return bool(0 <= change * np.sign(common) <= abs(common))
 
 
-def counted(stuck: Sequence[Stuck], found: Sequence[tuple[str, FaultKind, float]], time: int) -> tuple[Stuck, ...]:
+def counted(
+    stuck: Sequence[Stuck], found: Sequence[tuple[str, FaultKind, float]], time: int, most: int
+) -> tuple[Stuck, ...]:
     """Counts of frozen, saturated, reversed and exchanged channels after a window that found some."""
     old = {(s.channel, s.kind): s for s in stuck}
     now: dict[tuple[str, FaultKind], float] = {
@@ -431,7 +431,7 @@ def counted(stuck: Sequence[Stuck], found: Sequence[tuple[str, FaultKind, float]
     out = []
     for key in dict.fromkeys([*old, *now]):
         s = old.get(key) or Stuck(key[0], key[1], now[key], 0, time)
-        count = min(s.count + 1, 2 * HARD_FAULT_WINDOWS) if key in now else s.count - 1
+        count = min(s.count + 1, most) if key in now else s.count - 1
         if count > 0:
             out.append(replace(s, count=count, value=now.get(key, s.value)))
     return tuple(out)

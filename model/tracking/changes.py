@@ -16,10 +16,6 @@ from numpy.typing import NDArray
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.tracking.settings import TrackerSettings, design
 
-STEPS = 6.0  # windows that an alarm needs at least: one window counts at most threshold / STEPS
-QUIET = 0.25  # share of the threshold below which a baseline may still be refined
-RECOVERY_SHARE = 1 / 3  # recovery tests 0 against this share of the design change: a dead zone against flapping
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changes:
@@ -70,7 +66,7 @@ def update(
     armed = mask & (changes.learned >= settings.learning)
     variance = np.where(mask, variance, 1.0)
     tested, highest, threshold = _tested(changes, value, variance, armed, time, settings, doubt)
-    quiet = (highest < QUIET * threshold) & (tested.active == 0)
+    quiet = (highest < settings.rules.changes.quiet * threshold) & (tested.active == 0)
     refining = quiet & (changes.weight < settings.baseline_std**-2)
     gain = np.where(mask & (~armed | refining), 1.0 / variance, 0.0)
     return replace(
@@ -96,14 +92,14 @@ def _tested(
     size, threshold = design(settings.evidence(value.shape[-1]), settings.change, spread)
     offset = np.where(armed, value - baseline, 0.0)
     scale = np.where(armed, size / variance, 0.0)
-    most = threshold / STEPS
+    most = threshold / settings.rules.changes.steps
     up = _page(changes.up, scale * (offset - size / 2), most, threshold)
     down = _page(changes.down, scale * (-offset - size / 2), most, threshold)
     highest = np.maximum(up, down)
 
     closed, active, recovery = np.zeros_like(armed), changes.active, changes.recovery
     if active.any():
-        mild = RECOVERY_SHARE
+        mild = settings.rules.changes.recovery
         healthy = scale * mild * (mild * size / 2 - active * offset)
         recovery = _page(recovery, np.where(active != 0, healthy, 0.0), most, threshold)
         closed = (active != 0) & (recovery >= settings.recovery_evidence)

@@ -15,6 +15,7 @@ import numpy as np
 from sprung.model.identification.deviations import CARGO, OWN, Deviation
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.tracking.middle import median
+from sprung.model.tracking.rules import TRACKING_RULES, JumpRules
 
 GROUP_SHARE = 0.97  # of a delay's variance, common to the channels of one clock
 GAIN_WALK = 1e-4  # per sqrt(s): 0.6 % in an hour, 2 % in a working day
@@ -23,9 +24,7 @@ CLOCK_WALK = 2e-5  # s per sqrt(s), of a node's clock; 1.2 ms in an hour
 # walks 10 m along the car, or from one side to the other, is 1e-3.
 CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre": 1e-4, "side": 1e-4}
 OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
-REPORT_LIMIT = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is within the tolerance of electronics
 PUT_RIGHT = {"gain": 0.005, "delay": 8e-4}  # from which it is taken back from samples; a delay costs their ends
-DRIFT_LIMIT = {"gain": 0.03, "delay": 2e-3}  # a slow drift beyond it is an alarm: electronics age by 2 % a month
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +38,7 @@ class DeviationModel:
     loads: BoolArray  # True at the masses of loads, shape (H,)
     cargo: BoolArray  # True at everything that describes loads, their masses included, shape (H,)
     constant: BoolArray  # True at constants of bodies (inertia over mass, distances), which never change, shape (H,)
+    rules: JumpRules = TRACKING_RULES.jumps
 
     @property
     def size(self) -> int:
@@ -104,12 +104,12 @@ class DeviationModel:
     @cached_property
     def report_limit(self) -> FloatArray:
         """Size from which each deviation is reported, (H,); infinite for loads."""
-        return np.array([REPORT_LIMIT.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
+        return self._of_channels(self.rules.reported_gain, self.rules.reported_delay)
 
     @cached_property
     def put_right(self) -> FloatArray:
         """Size from which each deviation is taken back from samples, (H,); infinite for loads."""
-        return np.array([PUT_RIGHT.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
+        return self._of_channels(**PUT_RIGHT)
 
     @cached_property
     def channel_directions(self) -> BoolArray:
@@ -119,10 +119,19 @@ class DeviationModel:
     @cached_property
     def drift_limit(self) -> FloatArray:
         """Slow drift of each deviation up to which there is no alarm, (H,); infinite for loads."""
-        return np.array([DRIFT_LIMIT.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
+        return self._of_channels(self.rules.gain_drift, self.rules.delay_drift)
+
+    def jump_limit(self, kind: str) -> float:
+        """Size of a jump of a gain or a delay up to which there is no alarm."""
+        return self.rules.gain if kind == "gain" else self.rules.delay
+
+    def _of_channels(self, gain: float, delay: float) -> FloatArray:
+        """Limits of gains and delays, (H,); infinite for others."""
+        limits = {"gain": gain, "delay": delay}
+        return np.array([limits.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
 
 
-def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
+def model_of(deviations: Sequence[Deviation], rules: JumpRules = TRACKING_RULES.jumps) -> DeviationModel:
     """Delays of one clock share most of their variance; everything else is independent.
 
     Jumps are tested along each deviation, along the delays of a clock, and along those of all clocks of a node.
@@ -151,4 +160,4 @@ def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
     loads = np.array([kind == "load" for kind in kinds], dtype=bool)
     cargo = np.array([kind in CARGO for kind in kinds], dtype=bool)
     directions = np.array(rows).reshape(len(rows), H)
-    return DeviationModel(kinds, shared * np.outer(std, std), walk, directions, loads, cargo, constant)
+    return DeviationModel(kinds, shared * np.outer(std, std), walk, directions, loads, cargo, constant, rules)

@@ -17,25 +17,10 @@ from sprung.model.signals import BoolArray, Deviating, FloatArray, IntArray
 from sprung.model.tracking.deviation_model import DeviationModel
 from sprung.model.tracking.filter import Belief
 
-FORGETTING = 0.975  # factor on the evidence for a jump per window with sensitivities of its own: a memory of 40 s
-EVIDENCE = 22.0  # log-likelihood ratio of a jump; 2 exp(-22) times 92 directions: 0.1 in a month without pause
-MAX_SCORE = 5.0  # standard deviations that one window contributes at most: a jump takes two windows at least
-RESTART = 1.0  # log-likelihood ratio below which the evidence of earlier windows is dropped
-SUSPECTED = (
-    6.0  # log-likelihood ratio from which a deviation may explain changes of parameters: alarms wait for further
-)
-# windows; chance alone reaches it in some direction about once in ten windows
-DOUBT = 6.0  # log-likelihood ratio at which half of a suspected jump is added to the uncertainty of the belief
-ONSET = 3.0  # log-likelihood ratio whose first crossing dates the jump
 MEMORY = 0.3  # weight of the newest window in the mean sensitivities
 REFERENCE_TIME = 600.0  # s of used windows during which the reference of the baseline is still refined
-BODY_LIMIT = 0.01  # relative difference from the system file up to which constants of bodies are not reported
-JUMP_LIMIT = {"gain": 0.01, "delay": 3e-4, "load": 0.004}  # smaller jumps are tracked without an alarm
-KNOWN_SHARE = 0.2  # standard deviation, as a share of the drift limit, below which a deviation counts as known
-DRIFT_SHARE = 0.5  # of the drift limit: further from its first known value, a deviation is not the reference's any more
 LINEARISATION_ERROR = 0.5  # of the square of a gain: error of a window that was linearised without correcting the gain
 CORRECTED_GAIN = 0.06  # gain from which windows are corrected before they are linearised
-LOAD_CHANGE = 6.0  # standard deviations between a window's load and the believed one that mean another load
 STOPPED = 5.0  # s without a used window after which passengers may have boarded
 
 
@@ -116,7 +101,7 @@ def update(
     along = model.directions @ slope
     information = ((model.directions @ curvature) * model.directions).sum(axis=1).clip(1e-12)
     largest = float(np.max(np.abs(along) / np.sqrt(information), initial=0.0))
-    bounded = min(1.0, MAX_SCORE / max(largest, 1e-12))
+    bounded = min(1.0, model.rules.most / max(largest, 1e-12))
     calibration, jump = _test_jumps(calibration, model, along, information, bounded, time)
     agrees = bounded == 1.0 or jump is not None
     if jump is not None:
@@ -157,10 +142,11 @@ def update_reference(
     known, origin = np.isfinite(record.origin), record.origin
     if not (known | moved | ~here).all():
         std = model.relative_std(belief.covariance[-model.size :, -model.size :])
-        origin = np.where(here & ~known & ~moved & (std < KNOWN_SHARE * model.drift_limit), value, origin)
+        origin = np.where(here & ~known & ~moved & (std < model.rules.known * model.drift_limit), value, origin)
         known = np.isfinite(origin)
     off = np.where(known, value - origin, 0.0)
-    shifted = known & ~moved & (np.abs(off - model.common_value(off, known & ~moved)) > DRIFT_SHARE * model.drift_limit)
+    away = np.abs(off - model.common_value(off, known & ~moved))
+    shifted = known & ~moved & (away > model.rules.drifted * model.drift_limit)
     # A value common to all channels is not identifiable: when it wanders, references of moved deviations follow it.
     kept = np.where(shifted, origin, record.reference)
     kept = kept + model.common_value(value - record.reference, ~(moved | shifted))
@@ -179,7 +165,7 @@ def drifted(record: DeviationRecord, model: DeviationModel, belief: Belief) -> t
     far = np.abs(off) > model.drift_limit
     if far.any():
         std = model.relative_std(belief.covariance[-model.size :, -model.size :])
-        far &= std < KNOWN_SHARE * model.drift_limit
+        far &= std < model.rules.known * model.drift_limit
     return off, far
 
 
@@ -193,7 +179,7 @@ def pending_variance(record: DeviationRecord, model: DeviationModel) -> FloatArr
         return np.zeros(model.size)
     best = int(np.argmax(ratio))
     size = record.slope[best] / record.curvature[best]
-    return np.asarray((model.directions[best] != 0) * expit(ratio[best] - DOUBT) * size**2)
+    return np.asarray((model.directions[best] != 0) * expit(ratio[best] - model.rules.doubt) * size**2)
 
 
 def linearisation_std(gain: FloatArray) -> FloatArray:
@@ -244,16 +230,16 @@ def _test_jumps(
 ) -> tuple[DeviationRecord, Jump | None]:
     """Test statistics after a window whose scores are scaled by `bounded`, and a significant jump."""
     # Directions without evidence restart: quiet windows before a jump must not outweigh it.
-    old = calibration.slope
-    going = (old**2 > 2 * calibration.curvature * RESTART) & (old * (FORGETTING * old + along * bounded) > 0)
-    keep = np.where(going, FORGETTING, 0.0)
+    old, rules = calibration.slope, model.rules
+    lasting = old**2 > 2 * calibration.curvature * rules.restart
+    keep = np.where(lasting & (old * (rules.forgetting * old + along * bounded) > 0), rules.forgetting, 0.0)
     slope = keep * old + along * bounded
     curvature = keep * calibration.curvature + information
     ratio = slope**2 / (2 * curvature)
-    since = np.where((ratio >= ONSET) & (calibration.ratio < ONSET), time, calibration.since)
+    since = np.where((ratio >= rules.onset) & (calibration.ratio < rules.onset), time, calibration.since)
     best = int(np.argmax(ratio)) if len(ratio) else -1
     jump = None
-    if best >= 0 and ratio[best] >= EVIDENCE:
+    if best >= 0 and ratio[best] >= rules.evidence:
         direction = model.directions[best]
         kind = model.kinds[int(np.argmax(direction))]
         size = slope[best] / curvature[best] if bounded == 1.0 else along[best] / information[best]
@@ -299,7 +285,7 @@ def loads_changed(belief: Belief, model: DeviationModel, found: Deviating) -> bo
     M = root.T @ found.information[at][:, along]
     seen = M @ (found.point[along] - belief.mean[rows]) + root.T @ found.score[at]
     spread = np.eye(len(seen)) + M @ belief.covariance[rows][:, rows] @ M.T
-    return bool(seen @ np.linalg.solve(spread, seen) > LOAD_CHANGE**2)
+    return bool(seen @ np.linalg.solve(spread, seen) > model.rules.load**2)
 
 
 def reopen(belief: Belief, model: DeviationModel) -> Belief:

@@ -99,7 +99,7 @@ class Fusion:
         window = in_linear_scale(window, belief)
         filtered = self._filtered(state, belief, calibration, window)
         weather, tested = self._tested(state, calibration, conditions, window, filtered)
-        settled = jump is None and _is_settled(state, calibration, centre)
+        settled = jump is None and _is_settled(state, calibration, self.model, centre)
         new = replace(
             state,
             last=time_ns,
@@ -313,10 +313,10 @@ class Fusion:
         return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
 
 
-def _is_settled(state: TrackerState, calibration: dev.DeviationRecord, now: int) -> bool:
+def _is_settled(state: TrackerState, calibration: dev.DeviationRecord, model: DeviationModel, now: int) -> bool:
     """Whether no deviation is suspected to have jumped, nor has jumped a short time ago."""
     lately = any(a.kind == "sensor" and (now - a.opened) * 1e-9 < SETTLING for a in state.alarms)
-    return not lately and calibration.ratio.max(initial=0.0) < dev.SUSPECTED
+    return not lately and calibration.ratio.max(initial=0.0) < model.rules.suspected
 
 
 def _pressure(conditions: Conditions | None, loads: int) -> FloatArray:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sprung.model.signals import FloatArray
+from sprung.model.tracking.rules import TRACKING_RULES, TrackingRules
 
 SECONDS_PER_MONTH = 365.25 / 12 * 86400.0
 
@@ -51,6 +52,7 @@ class TrackerSettings:
     recovery_evidence: float = 12.0  # log-likelihood ratio for "healthy again" that closes an alarm
     outlier: float = 3.0  # standard deviations; beyond, influence no longer grows
     kept_alarms: int = 32  # closed alarms kept in the state; the store has them all
+    rules: TrackingRules = TRACKING_RULES  # the same for all vehicles
 
     def __post_init__(self) -> None:
         positive = ("window", "hop", "prior", "learning", "baseline_std", "change", "false_alarms_per_month")

@@ -19,7 +19,7 @@ from sprung.model.tracking import coverage, inflation, innovation, misfit
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import weather as weathers
-from sprung.model.tracking.alarms import HARD_FAULT_WINDOWS, Attribution, LoadLimit, counted
+from sprung.model.tracking.alarms import Attribution, LoadLimit, counted
 from sprung.model.tracking.deviation_model import model_of as deviation_model
 from sprung.model.tracking.deviations import Jump
 from sprung.model.tracking.fusion import KNOWN, Fusion, nanoseconds
@@ -74,9 +74,9 @@ class Tracker:
         self.names = tuple(parameter.name for parameter in self.parameters)
         self.settings = settings or TrackerSettings()
         self.deviations = tuple(deviations)
-        self.model = deviation_model(self.deviations)
+        self.model = deviation_model(self.deviations, self.settings.rules.jumps)
         nominal = [parameter.nominal for parameter in self.parameters]
-        self.weather = weather or weathers.model_of(self.names, nominal)
+        self.weather = weather or weathers.model_of(self.names, nominal, rules=self.settings.rules.weather)
         self._model_uncertainty = model_uncertainty or (
             np.zeros(len(self.names)),
             np.zeros((self.model.size, self.model.size)),
@@ -134,7 +134,7 @@ class Tracker:
         new, jump = self._fused(state, estimate, time_ns, centre, conditions)
         new = self._with_misfit(new, estimate, centre)
         seen = coverage.update(state.coverage, usable=new.used > state.used)
-        new = replace(new, time=time_ns, stuck=_stuck(state, estimate, centre), coverage=seen)
+        new = replace(new, time=time_ns, stuck=self._stuck(state, estimate, centre), coverage=seen)
         jump = jump if self._fusion.armed(state) else None
         return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), jump, centre))
 
@@ -163,6 +163,7 @@ class Tracker:
             adequate=estimate.adequate,
             inflation=float(state.inflation.factor.max()),
             time=centre,
+            rules=self.settings.rules.misfit,
         )
         return replace(state, fit=fit)
 
@@ -182,7 +183,7 @@ class Tracker:
         new = replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
         if estimate.informative or not estimate.faults:
             return new
-        new = replace(new, stuck=_stuck(state, estimate, centre))
+        new = replace(new, stuck=self._stuck(state, estimate, centre))
         return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), None, centre))
 
     def upgraded(self, state: TrackerState) -> TrackerState:
@@ -291,9 +292,13 @@ class Tracker:
                 f"an estimate of {estimate.log_ratio.shape} parameters came; the tracker has {len(self.names)}"
             )
 
+    def _stuck(self, state: TrackerState, estimate: Estimate, centre: int) -> tuple[Stuck, ...]:
+        found = [(f.channel, f.kind, f.value) for f in estimate.faults]
+        return counted(state.stuck, found, centre, 2 * self.settings.rules.alarms.hard)
+
     def hard_faults(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
         """Frozen, saturated, reversed and exchanged channels."""
-        reported = (s for s in state.stuck if s.count >= HARD_FAULT_WINDOWS)
+        reported = (s for s in state.stuck if s.count >= self.settings.rules.alarms.hard)
         return tuple(MeasurementFault(s.channel, s.kind, s.value) for s in reported)
 
     def known_faults(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
@@ -310,7 +315,7 @@ class Tracker:
         off = value - self.model.common_value(value)
         far = np.abs(off) > self.model.put_right
         chosen = np.zeros(H, dtype=bool)
-        for at in self.model.groups:  # all or none: differences between channels are what windows tell
+        for at in self.model.groups:  # all or none: differences between channels are what windows determine
             chosen[at] = far[at].any()
         return (*hard, *named(self.deviations, off, np.zeros(H), chosen))
 
@@ -338,7 +343,7 @@ class Tracker:
         for h in np.flatnonzero(self.model.constant).tolist():
             value = float(state.belief.mean[-H:][h])
             std = float(np.sqrt(state.belief.covariance[-H:, -H:][h, h] + self._model_uncertainty[1][h, h]))
-            if abs(value) > max(dev.BODY_LIMIT, 3 * std):
+            if abs(value) > max(self.model.rules.constants, 3 * std):
                 deviation = self.deviations[h]
                 found.append(BuiltOtherwise(deviation.name, OWN[deviation.kind], float(np.expm1(value)), std))
         return tuple(found)
@@ -393,7 +398,3 @@ class Tracker:
 
 def _is_usable(estimate: Estimate) -> bool:
     return estimate.adequate and estimate.converged
-
-
-def _stuck(state: TrackerState, estimate: Estimate, centre: int) -> tuple[Stuck, ...]:
-    return counted(state.stuck, [(f.channel, f.kind, f.value) for f in estimate.faults], centre)

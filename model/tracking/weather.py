@@ -23,6 +23,7 @@ import numpy as np
 
 from sprung.model.signals import BoolArray, Conditions, FloatArray, IntArray
 from sprung.model.tracking.middle import median
+from sprung.model.tracking.rules import TRACKING_RULES, WeatherRules
 
 CONDITIONS = 3
 KELVIN, SPEED = 10.0, 10.0  # units of the conditions
@@ -36,12 +37,9 @@ OF_KINDS = 3600.0, 0.01  # the same for a kind: oil and air temperature differ
 COMMON_WALK = 0.005 / math.sqrt(600.0)  # per sqrt(s), random walk of a kind's common level while the vehicle runs
 PAUSE_WALK = 0.02 / math.sqrt(3600.0)  # per sqrt(s), while it stands
 MAX_PAUSE = 0.08  # largest change during a pause
-FAST = 0.05  # log-ratio by which a kind may leave its settled level: oil that warms up, a weather front
 SETTLING = 6 * 3600.0  # s, time constant with which the settled level follows the common level
 NEAR = 0.025  # log-ratio about a kind's median: elements within this, or within their errors, move with it
 _NOTHING = np.zeros(1)
-RANGE = {"damping": 0.2, "stiffness": 0.12}  # largest effect of weather that is not measured
-OTHERS_RANGE = 0.1  # of other quantities
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +52,7 @@ class WeatherModel:
     kind_mean: FloatArray  # of kinds, shape (G, 1 + K)
     kind_std: FloatArray  # shape (G, 1 + K)
     most: FloatArray  # largest log-ratio of a kind that weather can explain, shape (G,)
+    rules: WeatherRules = TRACKING_RULES.weather
 
     @cached_property
     def groups(self) -> int:
@@ -89,7 +88,12 @@ class Weather:
     warmth: FloatArray  # the last temperature that was measured, 10 K; NaN: none, shape (1,)
 
 
-def model_of(names: Sequence[str], nominal: Sequence[float], by_load: Collection[str] = ()) -> WeatherModel:
+def model_of(
+    names: Sequence[str],
+    nominal: Sequence[float],
+    by_load: Collection[str] = (),
+    rules: WeatherRules = TRACKING_RULES.weather,
+) -> WeatherModel:
     """From parameters' names and nominal values; `by_load`: elements whose stiffness is proportional to the load."""
     group = _groups(names, nominal)
     G = int(group.max(initial=-1)) + 1
@@ -105,8 +109,9 @@ def model_of(names: Sequence[str], nominal: Sequence[float], by_load: Collection
             mean[i], std[i] = physics, np.hypot(std[i], np.multiply(open_, [0, 1, 1, 1]))
         else:
             kind_mean[group[i]], kind_std[group[i]] = physics, open_
-    most = [RANGE.get(names[int(np.argmax(group == g))].rpartition(".")[2], OTHERS_RANGE) for g in range(G)]
-    return WeatherModel(group, mean, std, kind_mean, kind_std, np.array(most, dtype=np.float64))
+    reach = {"damping": rules.damping, "stiffness": rules.stiffness}
+    most = [reach.get(names[int(np.argmax(group == g))].rpartition(".")[2], rules.others) for g in range(G)]
+    return WeatherModel(group, mean, std, kind_mean, kind_std, np.array(most, dtype=np.float64), rules)
 
 
 def _groups(names: Sequence[str], nominal: Sequence[float]) -> IntArray:
@@ -261,7 +266,7 @@ def update_common(
     weather = replace(weather, common=common, variance=spread)
     slack = np.minimum(weather.slack * math.exp(-min(elapsed, 60.0) / SETTLING) + math.sqrt(rest), MAX_PAUSE)
     part = -math.expm1(-elapsed / SETTLING)
-    slow = np.abs(common - weather.settled) < FAST + slack  # faster changes are no weather and never settle
+    slow = np.abs(common - weather.settled) < model.rules.fast + slack  # faster changes are no weather and never settle
     settled = weather.settled + np.where(slow, part * (common - weather.settled), 0.0)
     return replace(weather, settled=settled, slack=slack)
 
@@ -278,8 +283,8 @@ def settled_effect(weather: Weather, model: WeatherModel) -> FloatArray:
 
 def beyond_weather(weather: Weather, model: WeatherModel, share: float = 1.0) -> BoolArray:
     """Kinds that changed faster or further than weather can explain, shape (G,); `share` of the limits."""
-    certain = 4.0 * np.sqrt(weather.variance)
-    fast = np.abs(weather.common - weather.settled) > share * (FAST + weather.slack) + certain
+    certain = model.rules.certain * np.sqrt(weather.variance)
+    fast = np.abs(weather.common - weather.settled) > share * (model.rules.fast + weather.slack) + certain
     return np.asarray(fast | (np.abs(weather.common) > share * model.most + certain))
 
 

@@ -107,7 +107,7 @@ def test_what_is_quoted_of_a_run_is_json_of_every_number_that_was_varied() -> No
     told = varied("verdict", "clear")
     done = [{"recording": "made", "varied": {"verdict.clear": told}}]
     lines = [figure(stage, field, done) for stage, field in RULES.constants()]
-    found = json.loads(quoted(lines, done, "quick"))
+    found = json.loads(quoted(lines, done, "recordings (quick)"))
     assert list(found["numbers"]) == ["verdict.clear"]
     (change,) = found["numbers"]["verdict.clear"]["changes"]
     assert change == "at 2 the verdict in made: missing_physics -> consistent"
@@ -119,7 +119,7 @@ def test_what_is_known_of_more_recordings_stays_while_the_number_is_what_it_was(
     known = {"varied": [1.5, 1.25, 2.0], "recordings": 8, "changes": []}
     other = known | {"varied": [1.4, 1.25, 2.0]}
     for before, kept in (({"verdict.clear": known}, 8), ({"verdict.clear": other}, 1), ({}, 1)):
-        found = json.loads(quoted(lines, done, "quick", {"recordings": [], "numbers": before}))
+        found = json.loads(quoted(lines, done, "recordings (quick)", {"recordings": [], "numbers": before}))
         assert found["numbers"]["verdict.clear"]["recordings"] == kept
 
 
@@ -129,7 +129,7 @@ def test_what_is_known_of_stages_that_were_not_varied_stays() -> None:
     known = {"varied": [1.0, 0.5, 2.0], "recordings": 8, "changes": []}
     numbers = {"fit.prior": known, "verdict.gone": known}
     before = {"set": "8 recordings (quick)", "recordings": [str(number) for number in range(8)], "numbers": numbers}
-    found = json.loads(quoted(lines, done, "quick", before))
+    found = json.loads(quoted(lines, done, "recordings (quick)", before))
     assert list(found["numbers"]) == ["fit.prior", "verdict.clear"]
     assert found["set"] == before["set"] and found["recordings"] == before["recordings"]
     assert found["numbers"]["verdict.clear"]["on"] == ["made"]  # which is none of that set

@@ -11,7 +11,8 @@ import pytest
 from sprung.model.identification.deviations import Deviation
 from sprung.model.signals import Deviating, Estimate, FloatArray
 from sprung.model.tracking import deviations as dev
-from sprung.model.tracking.deviation_model import DRIFT_LIMIT, model_of
+from sprung.model.tracking.deviation_model import model_of
+from sprung.model.tracking.rules import TRACKING_RULES
 from sprung.model.tracking.state import Stuck
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from tests.tracker_windows import EPOCH, TrackedParameter, correlated, estimate
@@ -164,7 +165,7 @@ def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begi
         state = tracker.update(state, gained(rng, np.array([drift, 0, 0, 0, 0, 0])), EPOCH + k * SECOND)
         state = TrackerState.from_dict(state.to_dict()) if k % 100 == 0 else state
     assert all(a.kind == "sensor" for a in state.alarms)
-    assert [a.parameter for a in state.active] == ([] if to < DRIFT_LIMIT["gain"] else ["c0.gain"])
+    assert [a.parameter for a in state.active] == ([] if to < TRACKING_RULES.jumps.gain_drift else ["c0.gain"])
     for alarm in state.active:
         assert alarm.change is not None and alarm.std is not None
         assert abs(alarm.change - to) < 3 * alarm.std < 0.02
@@ -226,7 +227,7 @@ def test_one_window_that_shows_the_other_way_does_not_end_the_evidence_for_a_jum
     along, information = np.full(6, -1e3), np.full(6, 1e7)
     after, jump = dev._test_jumps(record, tracker.model, along, information, 1.0, EPOCH)
     assert jump is None
-    np.testing.assert_allclose(after.slope, dev.FORGETTING * 3e4 - 1e3)
+    np.testing.assert_allclose(after.slope, TRACKING_RULES.jumps.forgetting * 3e4 - 1e3)
     turned, _ = dev._test_jumps(record, tracker.model, np.full(6, -3e4), 10 * information, 1.0, EPOCH)
     np.testing.assert_allclose(turned.slope, -3e4)  # begins anew
 

@@ -8,7 +8,7 @@ from sprung.model.identification.identify import Identifier
 from sprung.model.signals import FloatArray
 from sprung.model.system import System, load_system
 from sprung.model.tracking import inflation
-from sprung.model.tracking.misfit import FLOOR_WINDOWS
+from sprung.model.tracking.rules import TRACKING_RULES
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from tests.tracker_windows import EPOCH, constant, correlated, estimate, make_tracker, windows
 
@@ -92,7 +92,7 @@ def test_the_noise_floor_is_fixed_although_one_parameter_is_never_identified() -
         level = 0.5 * np.exp(0.65 * k / len(stream))  # the residual nearly doubles, slowly
         blind = estimate(e.log_ratio, covariance, identifiable=told, chi_square=level * np.exp(0.05 * rng.normal()))
         state = tracker.update(state, blind, time)
-    assert state.fit.windows == FLOOR_WINDOWS
+    assert state.fit.windows == TRACKING_RULES.misfit.windows
     assert [alarm.kind for alarm in state.alarms] == ["misfit"]
 
 
