@@ -65,7 +65,7 @@ def compose_unforced(
         localization={},
         explained=judgement.explained,
         unexplained=Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), where),
-        summary=_summary(judgement.verdict, findings, track, where),
+        summary=_summary(judgement.verdict, findings, track, where, rules),
         advice=tuple(_advice(system, pooled, judgement, windows, rules)),
         track=track,
         plot_data=_arrays(track),
@@ -153,9 +153,11 @@ def _point(system: System, window: WindowResult) -> TrackPoint:
     return TrackPoint(window.begin, window.end, tuple(frequency.tolist()), tuple(deviation.tolist()), window.adequate)
 
 
-def _summary(verdict: str, findings: list[Finding], track: tuple[TrackPoint, ...], where: str) -> str:
+def _summary(
+    verdict: str, findings: list[Finding], track: tuple[TrackPoint, ...], where: str, rules: AmbientRules
+) -> str:
     first = np.array([point.frequency[0] for point in track])
-    sure = np.array([point.deviation[0] < 0.1 * point.frequency[0] for point in track])
+    sure = np.array([point.deviation[0] < rules.followed * point.frequency[0] for point in track])
     seen = first[sure] if sure.any() else first
     lowest = f"lowest natural frequency {np.min(seen):.4g} to {np.max(seen):.4g} Hz over {len(seen)} windows"
     text = "; ".join(f.sentence for f in findings)

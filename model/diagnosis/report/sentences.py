@@ -47,7 +47,7 @@ def _worst_bias(outcome: Outcome, without: str) -> str | None:
         return None
     shift = np.where(np.abs(shift) > state.options.rules.report.sure * sigma, shift, 0.0)
     worst = int(np.argmax(np.abs(shift)))
-    if abs(shift[worst]) < 0.01:
+    if abs(shift[worst]) < state.options.rules.report.bias:
         return None
     change = 100 * (np.exp(shift[worst]) - 1)
     side = "high" if change > 0 else "low"

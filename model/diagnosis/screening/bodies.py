@@ -21,6 +21,8 @@ from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
 from sprung.model.mechanics import ACCELERATION, VELOCITY
 from sprung.model.signals import FloatArray
 
+_FIRST_RATIO = 0.2, 5.0  # of masses, of a first step to another one
+
 
 def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
     """The best trial of every body law at every body, with the number of trials."""
@@ -55,8 +57,8 @@ def _masses(projector: Projector, law: BodyLaw) -> Iterator[tuple[Candidate, int
         ]
         scores = [projector.score(column, (spread, 0.0)) for column, spread in zip(shown, spreads, strict=True)]
     for name, (score, amplitude) in zip(held, scores, strict=True):
-        ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
-        term = Term(law, name, (ratio,), scales=(0.1,), known=(problem.rules.plausible.masses,))
+        ratio = float(np.clip(1 + amplitude, *_FIRST_RATIO))
+        term = Term(law, name, (ratio,), scales=(ratio,), known=(problem.rules.plausible.masses,))
         yield Candidate(term, score, MASS), 1
 
 
@@ -163,5 +165,5 @@ def _refined_line(
     score, frequency, (sine, cosine) = best
     amplitude = float(np.hypot(sine, cosine))
     values = (amplitude, float(frequency), float(np.arctan2(cosine, sine)))
-    term = Term(law, name, values, variant, scales=(max(amplitude, 1e-9), 1.0, 1.0))
+    term = Term(law, name, values, variant, scales=(max(amplitude, 1e-9), 1.0, projector.problem.rules.screening.phase))
     return Candidate(term, min(score, projector.problem.rules.screening.colour * rough), LINE)

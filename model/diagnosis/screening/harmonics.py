@@ -50,7 +50,7 @@ def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Candida
     i = int(np.argmax(scores))
     values, exact = _refined(projector.grid, law, channel, float(fundamentals[i]), best[i] / _PHASES)
     score = min(exact, rules.colour * float(scores[i]))
-    term = Term(law, location, values, scales=(max(values[0], 1e-9), 1.0, 0.1))
+    term = Term(law, location, values, scales=(max(values[0], 1e-9), 1.0, rules.turn))
     return Candidate(term, score, HARMONIC), tests
 
 

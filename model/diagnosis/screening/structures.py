@@ -76,8 +76,11 @@ def _of_all_springs(projector: Projector, law: StructureLaw) -> Iterator[tuple[C
         spectrum += projector.of_force[:, :, branch.element] * force[:, None]
     score, amount = projector.score(projector.pack(spectrum))
     if springs and amount > 0:
-        amount = min(_FAINT * amount, law.parameters[0].high)
-        yield Candidate(replace(term, parameters=(amount, *law.absent[1:]), scales=(amount, 0.1)), score, STRUCTURE), 1
+        amount, power = min(_FAINT * amount, law.parameters[0].high), projector.problem.rules.screening.power
+        yield (
+            Candidate(replace(term, parameters=(amount, *law.absent[1:]), scales=(amount, power)), score, STRUCTURE),
+            1,
+        )
 
 
 def _of_all_bodies(projector: Projector, law: StructureLaw) -> Iterator[tuple[Candidate, int]]:
@@ -104,7 +107,7 @@ def _of_all_bodies(projector: Projector, law: StructureLaw) -> Iterator[tuple[Ca
     values = np.zeros(len(law.parameters))
     values[: len(omegas)] = np.minimum(ratios, [spec.high for spec in law.parameters[: len(omegas)]])
     fixed = tuple(index >= len(omegas) for index in range(len(values)))
-    scales = (0.01,) * len(values)
+    scales = (projector.problem.rules.screening.modal,) * len(values)
     term = Term(law, "|".join(system.bodies), tuple(map(float, values)), scales=scales, fixed=fixed)
     yield Candidate(term, score, STRUCTURE), 1
 
@@ -204,7 +207,8 @@ def _connection(projector: Projector, law: StructureLaw, one: str, other: str) -
     best = int(np.argmax(score))
     values = (*map(float, amount[best]), *map(float, places[best]))
     fixed = (False, False, *(not matters for matters in free))
-    term = Term(law, location, values, scales=(*_sizes(system), 1.0, 1.0), fixed=fixed)
+    place = projector.problem.rules.screening.place
+    term = Term(law, location, values, scales=(*_sizes(system), place, place), fixed=fixed)
     return Candidate(term, float(score[best]), STRUCTURE), len(places)
 
 
@@ -305,7 +309,8 @@ def _suspended(projector: Projector, law: StructureLaw, name: str) -> tuple[Cand
     mass = float(np.clip(mass, 1e-4 * body, body))
     values = (mass, *map(float, trials[trial]), *map(float, places[place]))
     fixed = (False, False, False, *(not matters for matters in free))
-    term = Term(law, name, values, scales=(mass, 1.0, 1.0, 1.0, 1.0), fixed=fixed)
+    size = projector.problem.rules.screening.place
+    term = Term(law, name, values, scales=(mass, 1.0, 1.0, size, size), fixed=fixed)
     return Candidate(term, float(score[trial, place]), STRUCTURE), score.size
 
 
