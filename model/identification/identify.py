@@ -175,7 +175,7 @@ class Identifier:
     ) -> list[Estimate]:
         """Windows (B, T, C) as a tracker wants them, taken for right once `points` (B, H) have been taken back.
 
-        moved: whose inputs move, (B,).  The others tell nothing, however long they are refined.
+        moved: whose inputs move, (B,).  The others carry no information, however long they are refined.
         """
         if len(windows) == 0:
             return []

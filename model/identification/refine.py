@@ -37,7 +37,7 @@ IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not 
 WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
 NOISE_SHARE = 0.15  # of a sensitivity's power, at most
 VAGUE_SHARE = (
-    0.05  # of all of them, beyond which a load that is less certain than that is not told, nor what goes with it
+    0.05  # of all of them, beyond which a load that is less certain than that is not reported, nor what goes with it
 )
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 _SLACK = (

@@ -28,7 +28,7 @@ from sprung.model.laws import Law
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
-_BAND = 0.8  # of the residual's power, in the band that is told
+_BAND = 0.8  # of the residual's power, in the band that is reported
 
 
 def judged(

@@ -49,7 +49,7 @@ def _needs_no_names(unnamed: Investigation) -> bool:
 def with_laws_together(state: Investigation, search: Callable[[Investigation], Investigation]) -> Investigation:
     """The investigation, whose search has ended, with further named laws if these leave nearly nothing but noise.
 
-    A clearance and a stop are first told as a cubic spring; each of them is small beside it, and both replace it.
+    A clearance and a stop are first identified as a cubic spring; each of them is small beside it, and both replace it.
     """
     if not state.found or not state.options.unnamed or state.problem.process_noise:
         return state
