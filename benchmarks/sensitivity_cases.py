@@ -87,6 +87,21 @@ sensors:
   b1: {kind: acceleration, body: f1, csv: b1, noise: 0.003}
   a2: {kind: acceleration, body: f2, csv: a2, noise: 0.003}
 """
+FRAME = """
+name: frame
+sample_rate: 100
+window: 400
+bodies: {f1: {mass: 1000}, f2: {mass: 1000}, f3: {mass: 900}}
+inputs: {table: {kind: displacement, displacement: {csv: d, noise: 1.0e-6}}}
+elements:
+  s1: {upper: f1, lower: table, stiffness: 1.3e+6, damping: 100}
+  s2: {upper: f2, lower: f1, stiffness: 1.1e+6, damping: 100}
+  s3: {upper: f3, lower: f2, stiffness: 1.0e+6, damping: 100}
+sensors:
+  a1: {kind: acceleration, body: f1, csv: a1, noise: 0.002}
+  a2: {kind: acceleration, body: f2, csv: a2, noise: 0.002}
+  a3: {kind: acceleration, body: f3, csv: a3, noise: 0.002}
+"""
 WHEEL, VELOCITY, CAR_A, CAR_B, BOGIE_A = range(5)  # columns of its recordings
 
 
@@ -192,6 +207,7 @@ def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[t
         yield f"rig {name}", partial(_made, RIG, partial(rig, imperfect=imperfect), seed + 2, seconds)
     yield "shaken, exchanged", partial(_made, SHAKEN, shaken, seed + 3)
     yield "accelerations", partial(_on_hubs, seed + 4)
+    yield "frame", partial(_made, FRAME, frame, seed + 6)
 
 
 def _made(text: str, make: Callable[..., FalsifiedRecording], seed: int, *more: float) -> Made:
@@ -310,6 +326,20 @@ def shaken(random: np.random.Generator, samples: int = 4000) -> FalsifiedRecordi
     return FalsifiedRecording(
         "", frozenset(), shown + random.normal(0, 1, shown.shape) * [5, 3e-3, 3e-3, 3e-3], sample_rate=50.0
     )
+
+
+def frame(random: np.random.Generator, seconds: float = 60.0) -> FalsifiedRecording:
+    """A frame on a shaken table whose modes are damped one by one, the second most."""
+    file = yaml.safe_load(FRAME)
+    file["bodies"]["f1"]["laws"] = [{"modal_damping": {"mode_1": 0.012, "mode_2": 0.03, "mode_3": 0.012}}]
+    time = np.arange(round(seconds * RATE)) / RATE
+    f, phase = np.linspace(0.5, 18, 400), random.uniform(0, 2 * np.pi, 400)
+    table = (np.sin(2 * np.pi * f * time[:, None] + phase) @ (2e-4 / f))[:, None]
+    system = parse_system(yaml.safe_dump(file, sort_keys=False))
+    values = {p.name: p.nominal * float(np.exp(0.08 * random.standard_normal())) for p in system.parameters}
+    sensors = simulate_ride(system, table, values, noise=random).sensors
+    shown = table + 1e-6 * random.standard_normal(table.shape)
+    return FalsifiedRecording("", frozenset(), np.column_stack([shown, sensors]))
 
 
 def track(random: np.random.Generator, seconds: float = 120.0) -> FalsifiedRecording:

@@ -376,6 +376,6 @@ def test_laws_are_asked_for_what_they_do_and_not_compared_with_particular_ones(f
         for node in (one for one in ast.walk(tree) if isinstance(one, ast.Compare)):
             parts = [part for side in (node.left, *node.comparators) for part in ast.walk(side)]
             named = {part.id for part in parts if isinstance(part, ast.Name)} & laws
-            said = {part.value for part in parts if isinstance(part, ast.Constant)} & listed
+            said = {str(part.value) for part in parts if isinstance(part, ast.Constant)} & listed
             wrong += [f"{path.relative_to(ROOT).as_posix()}:{node.lineno} {one}" for one in (*named, *said)]
     assert wrong == []
