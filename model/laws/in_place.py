@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sprung.model.laws.base import BodyLaw, StructureLaw
+from sprung.model.laws.base import BodyLaw, Law, StructureLaw, Values
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.laws.structure import sites_of
 from sprung.model.mechanics import Mechanics
@@ -36,17 +36,24 @@ def is_linear(placed: PlacedLaw) -> bool:
 
 def put_in_place(file: SystemFile, mechanics: Mechanics, placed: PlacedLaw) -> Mechanics:
     """The mechanics with one law of a body or of the structure.  Errors: `LawError`."""
-    law = placed.law
+    law, variant = placed.law, placed.variant
+    if isinstance(law, BodyLaw):
+        variants = law.variants(mechanics, list(file.bodies).index(placed.location))
+        variant = variant or variants[0]
+        if variant not in variants:
+            raise LawError(f"{placed.location}: {law.name} has no variant {variant!r}; it has {', '.join(variants)}")
+    return with_law(file, mechanics, law, placed.location, placed.values, variant)
+
+
+def with_law(
+    file: SystemFile, mechanics: Mechanics, law: Law, location: str, values: Values, variant: str
+) -> Mechanics:
+    """The mechanics with a law of a body or of the structure at a location; as they are with any other law."""
     if isinstance(law, StructureLaw):
-        sites = sites_of(file, placed.location)
-        return law.modify(mechanics, sites, placed.values, placed.variant or law.variants[0])
-    assert isinstance(law, BodyLaw)
-    body = list(file.bodies).index(placed.location)
-    variants = law.variants(mechanics, body)
-    variant = placed.variant or variants[0]
-    if variant not in variants:
-        raise LawError(f"{placed.location}: {law.name} has no variant {variant!r}; it has {', '.join(variants)}")
-    return law.modify(mechanics, body, placed.values, variant)
+        return law.modify(mechanics, sites_of(file, location), values, variant or law.variants[0])
+    if isinstance(law, BodyLaw):
+        return law.modify(mechanics, list(file.bodies).index(location), values, variant)
+    return mechanics
 
 
 def misplaced(file: SystemFile, mechanics: Mechanics, laws: Sequence[PlacedLaw]) -> list[str]:

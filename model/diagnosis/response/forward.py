@@ -19,8 +19,8 @@ from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, Harmonic
 from sprung.model.diagnosis.response.newton import PATIENCE, newton_step
 from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branches_of, evaluated_in_time, supports
-from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, StructureLaw, SupportLaw
-from sprung.model.laws.structure import sites_of
+from sprung.model.laws import CLOCK_LEAD, SensorLaw, SensorResponse, SpringDamper, SupportLaw
+from sprung.model.laws.in_place import with_law
 from sprung.model.mechanics import VELOCITY
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -39,12 +39,8 @@ def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: 
             values[system.elements.index(parameter.element)] *= ratio
     mechanics = replace(mechanics, mass=mass, stiffness=stiffness, damping=damping)
     for term in terms:
-        if isinstance(term.law, BodyLaw) and term.law.load is None:
-            body = system.bodies.index(term.location)
-            mechanics = term.law.modify(mechanics, body, term.parameters, term.variant)
-        elif isinstance(term.law, StructureLaw):
-            sites = sites_of(system.file, term.location)
-            mechanics = term.law.modify(mechanics, sites, term.parameters, term.variant)
+        if term.law.load is None:  # else its force is added to the response
+            mechanics = with_law(system.file, mechanics, term.law, term.location, term.parameters, term.variant)
     return Structure.nominal(mechanics, sensors)
 
 
