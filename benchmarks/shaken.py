@@ -3,7 +3,7 @@
 Shear buildings under motion like an earthquake's, with every storey a few percent off the system file's values: as the
 file says, with one floor heavier, with a storey that yields, with bending that couples more than neighbouring storeys.
 Frames under a measured force whose modes are damped on their own, one of them with a heavier plate.  Slabs on sliding
-bearings.  Quarter cars with bump stops and with an asymmetric damper that blows off.  Integrated here (Runge-Kutta, four
+bearings.  Quarter cars with stops and with an asymmetric damper that blows off.  Integrated here (Runge-Kutta, four
 steps a sample, forty of bearings), frames by their exact response.  For each: verdict, findings, held-out error before
 and after, floor, processor time.
 """
