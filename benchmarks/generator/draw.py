@@ -40,7 +40,7 @@ class Case:
     def findings(self) -> list[dict[str, Any]]:
         """The truth as the published labels write it."""
         found: list[dict[str, Any]] = [
-            {"location": place, "effect": law, "parameters": p} for place, law, p in self.effects
+            {"location": place, "effect": LAWS[law].known_as or law, "parameters": p} for place, law, p in self.effects
         ]
         if self.flex:
             found.append({"location": "car", "effect": "flexible_mode", "parameters": self.flex[:2]})
@@ -63,7 +63,7 @@ class Case:
         """What a perfect diagnosis would say."""
         if self.fault:
             return "sensor_fault"
-        if any(not LAWS[law].named for _, law, _ in self.effects):
+        if any(not (LAWS[law].named or LAWS[law].known_as) for _, law, _ in self.effects):
             return "unknown_physics"
         return "missing_physics" if self.findings() else "consistent"
 

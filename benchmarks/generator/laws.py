@@ -26,6 +26,7 @@ class Law:
     draw: Callable[..., list[float]]
     memory: bool = False
     named: bool = True  # in the published list of words; otherwise the right verdict is unknown physics
+    known_as: str = ""  # a law of the catalogue that describes it as well, if it has another name
     strength: tuple[float, float] = (0.01, 0.4)
 
 
@@ -183,6 +184,7 @@ LAWS: dict[str, Law] = {
         one_sided_stop,
         lambda rng, s, k, c, D, R: [rng.uniform(0.6, 1.5) * D, 12 * s * k],
         named=False,
+        known_as="bump_stop",
         strength=(0.02, 0.4),
     ),
     "saturating_spring": Law(
