@@ -286,6 +286,7 @@ class NoiseRules:
 
     least: float = rule(1.12, "ratio to its peers; chosen: less is no maintenance", 1.06, 1.25)
     sigmas: float = rule(6.0, "by which the ratio leaves its peers'; derived: chance and modelling errors", 4.0, 8.0)
+    of_error: float = rule(0.5, "of the power that a model leaves, that noise must be; derived: most of it", 0.3, 0.7)
     inaccuracy: float = rule(0.05, "of the power that findings changed, which they may have wrong; chosen", 0.02, 0.1)
     upper: float = rule(0.38, "of the sample rate; derived: above, anti-alias filters cut", 0.34, 0.42)
     white: float = rule(0.5, "of the excess, that goes on above the band; derived: noise does, physics ends", 0.3, 0.7)

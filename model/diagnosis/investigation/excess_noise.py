@@ -15,7 +15,8 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     """Sensors and input channels that are significantly noisier than their peers.
 
     before, after: free runs without and with the findings.  A share of the power that the findings changed at a sensor
-    may be their inaccuracy, and does not count as noise.
+    may be their inaccuracy, and does not count as noise; nor does a level that is not about what the model leaves: this
+    is the misfit of another structure.
     """
     declared = declared_noise(state.system, state.prepared.signals, state.options.rules)
     noise, rules = state.problem.noise, state.options.rules.noise
@@ -29,6 +30,7 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     white = upper_ratio(state, known) > 1 + rules.white * (inside - 1)
     inaccuracy = rules.inaccuracy * np.mean((after.simulated - before.simulated) ** 2, axis=0)
     white &= (inside**2 - np.median(inside) ** 2) * known**2 > inaccuracy
+    white &= is_what_is_left(noise.sensors**2, np.mean((after.measured - after.simulated) ** 2, axis=0), rules)
     found += outliers(names, inside, white, count, rules)
     pairs = state.problem.part.pairs
     if len(pairs):
@@ -39,6 +41,12 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
         found += outliers([f"{n}.displacement" for n in supports], d, every, rules.displacement * count, rules)
         found += outliers([f"{n}.velocity" for n in supports], v, every, rules.velocity * count, rules)
     return tuple(found)
+
+
+def is_what_is_left(noise: np.ndarray, error: np.ndarray, rules: NoiseRules) -> np.ndarray:
+    """Whether noise is about as large as the error of a free run, both as powers."""
+    found: np.ndarray = (noise > rules.of_error * error) & (error > rules.of_error * noise)
+    return found
 
 
 def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:

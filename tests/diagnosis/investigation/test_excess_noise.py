@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.investigation.excess_noise import outliers
+from sprung.model.diagnosis.investigation.excess_noise import is_what_is_left, outliers
 from sprung.model.diagnosis.rules import RULES
 
 NAMES = ["a", "b", "c", "d", "e"]
@@ -38,3 +38,8 @@ def test_what_ends_with_the_band_is_no_noise_and_two_channels_cannot_be_told_apa
 def test_a_significant_ratio_that_no_workshop_would_mind_is_none() -> None:
     assert not outliers(NAMES, np.array([1.0, 1.0, 0.99 * RULE.least, 1.0, 1.0]), EVERY, 1e6, RULE)
     assert not outliers(NAMES, np.array([1.0, 1.0, 1.5, 1.0, 1.0]), EVERY, 20, RULE)  # and one of few bins
+
+
+def test_a_level_that_is_not_what_a_free_run_leaves_is_the_misfit_of_another_structure() -> None:
+    error = np.array([1.0, 1.0, 1.0, 1.0])
+    assert is_what_is_left(np.array([0.1, 0.9, 1.2, 60.0]), error, RULE).tolist() == [False, True, True, False]
