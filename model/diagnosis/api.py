@@ -15,9 +15,9 @@ from sprung.model.diagnosis.investigation.state import Options, Outcome, Progres
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError, prepare
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.report.report import Finding, Report
+from sprung.model.diagnosis.selection.along_measured import with_disturbances
 from sprung.model.laws import ElementLaw
 from sprung.model.laws.following import Covariate, following_law
-from sprung.model.schema import ForceInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -90,9 +90,8 @@ def _along_what_was_seen(system: System, record: Recorded, options: Options, pro
     A law that shifts the frequency makes a linear start diverge within a few periods.  With forces that nobody measured
     on every body, as strong as they have to be, the fit is one of forces along the measured motion.
     """
-    forces = {f"disturbance of {body}": ForceInput(kind="force", body=body) for body in system.bodies}
-    pushed = replace(system, file=system.file.model_copy(update={"inputs": forces}))
-    none = np.zeros((len(record.values), len(forces)))
+    pushed = with_disturbances(system)
+    none = np.zeros((len(record.values), len(system.bodies)))
     values = np.column_stack([none, record.values])
     outcome = investigate(pushed, RecordedPart(record.sample_rate, values, record.lost), options, progress)
     return None if outcome.judgement.rejected else outcome

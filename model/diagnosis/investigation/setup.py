@@ -42,7 +42,6 @@ from sprung.model.diagnosis.screening.structures import structure_candidates
 from sprung.model.diagnosis.selection.compete import compete
 from sprung.model.diagnosis.selection.starts import structure_starts
 from sprung.model.laws import ElementLaw, StructureLaw
-from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 
@@ -77,12 +76,12 @@ def without_setup_faults(
     present = misfit(fit)
     rules = problem.rules.setup
     while len(found) < rules.most and float(np.max(present)) > rules.misfit:
-        best = None
+        best, total = None, float(np.sum(np.minimum(present, 1.0)))  # a prediction of nothing leaves 1 of every sensor
         if not found and suspected is not None:
-            best = _confirmed(suspected, system, signals, declared, split, problem, present)
+            best = _confirmed(suspected, system, signals, declared, split, problem, total)
         elif not found:
             best = _reversed_by_onset(system, signals, declared, split, problem, fit)
-        best = best or _best(system, signals, declared, split, problem, fit, present)
+        best = best or _best(system, signals, declared, split, problem, fit, total)
         if best is None or _is_outdone(best.fault, problem, fit):
             break
         system, signals, split, problem, fit = best.system, best.signals, best.split, best.problem, best.fit
@@ -150,11 +149,10 @@ def _best(
     split: int,
     problem: Problem,
     fit: Fit,
-    present: FloatArray,
+    total: float,
 ) -> _FittedFault | None:
-    """The fitted hypothesis that explains most, if one explains enough."""
+    """The fitted hypothesis that explains most of the misfit `total`, if one explains enough."""
     rules = problem.rules.setup
-    total = float(np.sum(np.minimum(present, 1.0)))  # a prediction of nothing leaves 1 of every sensor
     accepted: list[_FittedFault] = []
     refined: dict[int, _FittedFault] = {}  # by the identity of the accepted one
     for ranked in _ranked(system, signals, problem, fit, total):
@@ -185,10 +183,9 @@ def _confirmed(
     declared: Noise,
     split: int,
     problem: Problem,
-    present: FloatArray,
+    total: float,
 ) -> _FittedFault | None:
-    """A hypothesis fitted and estimated again, if it then explains enough."""
-    total = float(np.sum(np.minimum(present, 1.0)))
+    """A hypothesis fitted and estimated again, if it then explains enough of the misfit `total`."""
     one = _tried(suspected, system, signals, declared, split, problem, total)
     one = None if one is None else _refined(one, declared)
     return one if one is not None and one.fault.after < problem.rules.setup.explains * total else None

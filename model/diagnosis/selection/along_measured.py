@@ -24,6 +24,7 @@ from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.starts import joint_start, wider_starts
 from sprung.model.laws import ElementLaw
 from sprung.model.schema import ForceInput
+from sprung.model.system import System
 
 _STEPS = 8  # of a fit along the measured motion
 _PER_MASS = 1.0  # m/s^2, first level of the unmeasured forces over the masses they act on
@@ -42,9 +43,6 @@ class MeasuredMotion:
         if problem.process_noise:
             return None
         system, part, count = problem.system, problem.part, len(problem.system.bodies)
-        forces = {f"unmeasured force on {body}": ForceInput(kind="force", body=body) for body in system.bodies}
-        inputs = {**system.file.inputs, **forces}
-        pushed = replace(system, file=system.file.model_copy(update={"inputs": inputs}))
         still = replace(
             part,
             force=np.zeros((len(part.force), count), dtype=part.force.dtype),
@@ -52,7 +50,7 @@ class MeasuredMotion:
         )
         masses = [system.file.bodies[body].mass.value for body in system.bodies]
         noise = replace(problem.noise, force=_PER_MASS * np.array(masses))
-        along = replace(problem, system=pushed, part=still, noise=noise, memory=None)
+        along = replace(problem, system=with_disturbances(system), part=still, noise=noise, memory=None)
         start = Point(np.zeros_like(base.point.theta), base.point.terms, np.zeros(0))
         start = replace(start, state=np.zeros(along.forward(start).plant.structure.states))
         try:
@@ -97,3 +95,9 @@ def _blunter(point: Point) -> list[Point]:
     values = np.array(term.parameters)
     values[term.law.corner] *= 2.0
     return [replace(point, terms=(*point.terms[:-1], term.at(values)))]
+
+
+def with_disturbances(system: System) -> System:
+    """A system with one more force input on every body, for what nobody measured."""
+    forces = {f"disturbance of {body}": ForceInput(kind="force", body=body) for body in system.bodies}
+    return replace(system, file=system.file.model_copy(update={"inputs": {**system.file.inputs, **forces}}))
