@@ -75,11 +75,16 @@ def _begun(
     start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
     if len(noise.force):
         # far from the optimum of a lightly damped system there is no descent; force noise then accounts for the misfit
-        lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), noise)))
-        problem = replace(problem, noise=force_noise(lin.forward, lin.spectrum, noise, rules.noise))
+        problem = with_force_noise(problem, start)
     if not system.file.inputs:
         start = replace(start, theta=_from_the_beginning(problem, first, declared, start))
     return problem, optimise(problem, start)
+
+
+def with_force_noise(problem: Problem, start: Point) -> Problem:
+    """A problem with the levels of its forces by what a start leaves."""
+    lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), problem.noise)))
+    return replace(problem, noise=force_noise(lin.forward, lin.spectrum, problem.noise, problem.rules.noise))
 
 
 def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, start: Point) -> FloatArray:

@@ -11,13 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.baseline import refreshed
-from sprung.model.diagnosis.fit.jacobian import linearise
-from sprung.model.diagnosis.fit.noise import force_noise
+from sprung.model.diagnosis.fit.baseline import refreshed, with_force_noise
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.fit.smoothing import Working
-from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
@@ -55,8 +51,7 @@ class MeasuredMotion:
         start = replace(start, state=np.zeros(along.forward(start).plant.structure.states))
         try:
             with np.errstate(all="ignore"):
-                lin = linearise(along, start, Working(Whitener.of(along.forward(start), noise)))
-                along = replace(along, noise=force_noise(lin.forward, lin.spectrum, noise, along.rules.noise))
+                along = with_force_noise(along, start)
         except (np.linalg.LinAlgError, FloatingPointError):
             return None
         fit = try_optimise(along, start, _STEPS)
