@@ -50,14 +50,18 @@ def is_what_is_left(noise: np.ndarray, error: np.ndarray, rules: NoiseRules) -> 
 
 
 def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
-    """Residual over declared noise above the compared band, up to where anti-alias filters cut, per sensor."""
+    """Noise over declared noise above the compared band, up to where anti-alias filters cut, per sensor.
+
+    It is the residual's there, but at most the measured signal's: a wrong structure may resonate where nothing moves.
+    """
     grid, plant = state.problem.part.grid, state.fit.forward.plant
     upper = slice(grid.band.stop, int(state.options.rules.noise.upper * grid.samples))
     if upper.stop - upper.start < state.options.rules.noise.bins:
         return np.full(len(declared), np.inf)
     variance = state.problem.noise.support_variance(grid.omega[upper])
     through = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support[upper]) ** 2, variance).mean(axis=0)
-    power = np.mean(np.abs(state.fit.spectrum[upper]) ** 2, axis=0)
+    residual, measured = state.fit.spectrum[upper], state.problem.part.sensors[upper]
+    power = np.minimum(np.mean(np.abs(residual) ** 2, axis=0), np.mean(np.abs(measured) ** 2, axis=0))
     found: np.ndarray = np.sqrt(np.maximum(power - through, 0.0)) / declared
     return found
 

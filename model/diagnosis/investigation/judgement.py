@@ -151,10 +151,10 @@ def realised_floor(expected: FloatArray, after: FreeRun, rules: VerdictRules = R
     """Noise floor of each sensor on the held-out samples themselves.
 
     `expected` is the mean for the estimated noise.  If the error of the free run agrees with it within sampling error,
-    it is noise, and the floor of these samples.
+    it is noise, and the floor of these samples; if it is smaller, so is the noise, which is part of it.
     """
     spread = rules.spread * np.sqrt(1 / (2 * len(after.measured)))
-    return np.where(np.abs(after.per_sensor / expected - 1) < spread, after.per_sensor, expected)
+    return np.where(after.per_sensor / expected - 1 < spread, after.per_sensor, expected)
 
 
 def _compared(state: Investigation, noise: Noise) -> tuple[tuple[Fit, Noise], ...]:

@@ -3,8 +3,14 @@
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.investigation.excess_noise import is_what_is_left, outliers
+from sprung.benchmarks.shaken import building
+from sprung.model.diagnosis.investigation.diagnose import begun
+from sprung.model.diagnosis.investigation.excess_noise import is_what_is_left, outliers, upper_ratio
+from sprung.model.diagnosis.investigation.judgement import realised_floor
+from sprung.model.diagnosis.investigation.state import Options
+from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.rules import RULES
+from sprung.model.diagnosis.selection.holdout import FreeRun
 
 NAMES = ["a", "b", "c", "d", "e"]
 EVERY = np.ones(5, dtype=bool)
@@ -43,3 +49,19 @@ def test_a_significant_ratio_that_no_workshop_would_mind_is_none() -> None:
 def test_a_level_that_is_not_what_a_free_run_leaves_is_the_misfit_of_another_structure() -> None:
     error = np.array([1.0, 1.0, 1.0, 1.0])
     assert is_what_is_left(np.array([0.1, 0.9, 1.2, 60.0]), error, RULE).tolist() == [False, True, True, False]
+
+
+def test_resonances_of_a_wrong_structure_are_not_taken_for_noise() -> None:
+    rig = building(8, "bending", 3, 20.0)
+    state = begun(rig.system, rig, Options(), lambda share, what: None)
+    declared = declared_noise(state.system, state.prepared.signals).sensors
+    residual = np.abs(state.fit.spectrum[state.problem.part.grid.band.stop :])
+    assert np.max(np.sqrt(np.mean(residual**2, axis=0)) / declared) > 10  # the fitted model is far off there
+    ratio = upper_ratio(state, declared)  # a bound: some motion goes on above the band
+    assert np.all(ratio > 0.9) and np.all(ratio < 2)
+
+
+def test_a_floor_is_at_most_the_error_that_contains_it() -> None:
+    measured, errors = np.ones((2000, 3)), np.array([0.5, 1.01, 3.0])
+    run = FreeRun(measured, measured, errors, None)  # type: ignore[arg-type]  # the point is not read
+    assert realised_floor(np.ones(3), run).tolist() == [0.5, 1.01, 1.0]
