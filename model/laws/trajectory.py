@@ -103,12 +103,13 @@ def _runge_kutta(path: FloatArray, node: _Rate, half: _Rate, h: float) -> FloatA
 
     node, half: rates of the states (memory, ...) at a sample, and in the middle of the step that begins there.
     """
-    for i in range(len(path) - 1):
-        z = path[i]
-        n0 = node(i, z)
-        na = half(i, z + h / 2 * n0)
-        nb = half(i, z + h / 2 * na)
-        path[i + 1] = z + h / 6 * (n0 + 2 * (na + nb) + node(i + 1, z + h * nb))
+    with np.errstate(over="ignore", invalid="ignore"):  # values of a trial may run away: the path then is not finite
+        for i in range(len(path) - 1):
+            z = path[i]
+            n0 = node(i, z)
+            na = half(i, z + h / 2 * n0)
+            nb = half(i, z + h / 2 * na)
+            path[i + 1] = z + h / 6 * (n0 + 2 * (na + nb) + node(i + 1, z + h * nb))
     return path
 
 
