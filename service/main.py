@@ -58,7 +58,7 @@ class Interrupted(Exception):
 def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[str], None]) -> None:
     """Run until SIGINT or SIGTERM; what was accepted is stored before this returns.
 
-    watch: callbacks that show a recording's progress and outcome; announce: told the address once it is open.
+    watch: callbacks that show a recording's progress and outcome; announce: called with the address once it is open.
     Raises UserError for settings, files and buses that cannot be used.
     """
     check_access(settings)

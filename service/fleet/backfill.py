@@ -53,7 +53,7 @@ class BackfillPlan:
 
     @property
     def name(self) -> str:
-        """Tells this back-fill from others: started again, it goes on where it stopped."""
+        """Distinguishes this back-fill from others: started again, it goes on where it stopped."""
         return hashlib.sha256(f"{self.place} {self.since} {self.until}".encode()).hexdigest()[:12]
 
 

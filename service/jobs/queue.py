@@ -39,7 +39,7 @@ class Cancelled(Exception):
 
 
 class Progress:
-    """What a handler reports to; `check` also tells it to stop."""
+    """What a handler reports to; `check` also asks it to stop."""
 
     def __init__(self, note: Callable[[float], None], stopping: threading.Event, seconds: float) -> None:
         """note: takes the share that is done; seconds: that the job may take."""

@@ -101,8 +101,8 @@ class Batcher:
         observe: Callable[[dict[str, float]], None],
         beside: Batcher | None = None,
     ) -> None:
-        """limit: windows that may wait; observe: told the seconds of each stage, both queues among them; beside: takes
-        the windows of vehicles with a model of their own, for which others do not wait; such vehicles take turns."""
+        """limit: windows that may wait; observe: called with the seconds of each stage, both queues among them; beside:
+        takes the windows of vehicles with a model of their own, for which others do not wait; these take turns."""
         self._pipeline = pipeline
         self._compute = compute
         self._limit = limit

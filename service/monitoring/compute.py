@@ -32,7 +32,7 @@ class Compute:
     """
 
     def __init__(self, queue_size: int, on_wait: Callable[[float], None] = lambda seconds: None) -> None:
-        """on_wait: told how long each function waited for its turn, s."""
+        """on_wait: called with the time that each function waited for its turn, s."""
         self._queue: queue.PriorityQueue[tuple[int, int, float, Callable[[], Any], Future[Any]]] = queue.PriorityQueue(
             queue_size
         )

@@ -117,7 +117,7 @@ def load_engine(settings: Settings) -> Engine:
 
     Raises UserError, or the model's own one-line ValueErrors, when one of them cannot be used.
     """
-    # takes a second; a bad system file is told before
+    # takes a second; a bad system file is reported before
     from sprung.model.identification.identify import load_identifier, without_weights
 
     one_thread_an_operation()
@@ -176,7 +176,7 @@ def seconds_of_a_window(engine: Engine) -> float:
 
 
 def make_tracker(system: System) -> Tracker:
-    """The tracker of a system, told its window and hop."""
+    """The tracker of a system, with its window and hop."""
     rate = system.sample_rate
     settings = TrackerSettings(window=system.window / rate, hop=system.hop / rate)
     limits = {load.body: LoadLimit(load.empty, load.least, load.most) for load in system.loads if load.declared}

@@ -60,7 +60,7 @@ class Pipeline:
         follow: Following = follow,
         beside: Compute | None = None,
     ) -> None:
-        """on_alarms: told of alarms that open, change or close, inside the transaction that stores them.
+        """on_alarms: called with alarms that open, change or close, inside the transaction that stores them.
 
         staging: digest under which everything is kept unseen (`service.store.staging`); follow: feeds windows to
         trackers; beside: for windows of vehicles with a model of their own, so that others never wait for a slow one.

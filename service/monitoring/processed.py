@@ -47,7 +47,7 @@ NO_EXCITATION = "no excitation: standstill, or too slow to tell anything"
 
 
 def outcome_of(window: Window, estimate: Estimate | None) -> tuple[str, str | None]:
-    """A window's outcome with the reason for it, once it is known what it tells."""
+    """A window's outcome with the reason for it, once it is known."""
     if estimate is None:
         return window.outcome, window.reason
     if not estimate.informative:
@@ -83,7 +83,7 @@ class WindowsToFold:
 
 @dataclass(frozen=True, slots=True)
 class Newcomer:
-    """What a new vehicle was told last."""
+    """What was last given to a new vehicle."""
 
     vehicles: int  # there were then
     at: int  # ns

@@ -18,7 +18,7 @@ from sprung.service.store.windows import WindowRecord, known_windows, newest_sta
 
 @dataclass(frozen=True, slots=True)
 class FoundWindow:
-    """A window with what it told."""
+    """A window with its results."""
 
     vehicle: str
     window: Window

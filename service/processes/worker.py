@@ -39,7 +39,7 @@ PR_SET_PDEATHSIG = 1
 
 
 class WorkerFailed(RuntimeError):
-    """The work raised what no user can be told; the message is its traceback."""
+    """The work failed with an error that is not meant for users; the message is its traceback."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class Worker(Generic[Message, Result]):
         return self._result
 
     def messages(self, check: Callable[[], None] = lambda: None) -> Iterator[Message]:
-        """What the task tells, as it comes; ends when the task is done.
+        """The task's messages, as they come; ends when the task is done.
 
         check: called ten times a second, may raise to give up; the process is then ended.
         Raises UserError for input that cannot be used, for limits that are exceeded and for a process that died;

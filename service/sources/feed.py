@@ -57,7 +57,7 @@ class FeedResult:
 
     @property
     def monitored(self) -> bool:
-        """Whether the recording tells how its vehicle is: windows were used, and few samples are lost."""
+        """Whether the recording informs on its vehicle: windows were used, and few samples are lost."""
         usable = self.windows["used"] + self.windows["repaired"] - self.late
         return usable > 0 and self.lost < MOST_LOST * self.expected
 

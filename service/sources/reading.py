@@ -21,7 +21,7 @@ from sprung.service.sources.opening import open_stream
 
 T = TypeVar("T")
 READ_AHEAD = 2  # batches; with them memory stays flat however long the file is
-SIGN_OF_LIFE_SECONDS = 1.0  # a file without windows is told of, too
+SIGN_OF_LIFE_SECONDS = 1.0  # a file without windows is reported, too
 WAIT_SECONDS = 0.1
 SLOWEST_BYTES_PER_SECOND = 100_000  # any reader is faster, by an order of magnitude
 

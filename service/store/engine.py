@@ -43,7 +43,7 @@ class Store:
         self.many_writers = engine.dialect.name == "postgresql"
         # one writer a process where the database has one anyway: waiting is fair here
         self._writing = threading.BoundedSemaphore(MOST_WRITERS if self.many_writers else 1)
-        self.on_wait: Callable[[float], None] = lambda seconds: None  # told how long each transaction waited to write
+        self.on_wait: Callable[[float], None] = lambda seconds: None  # takes each transaction's wait to write
         self.months: set[str] = set()  # partitions that are known to be there (`partitions.prepare`)
 
     @contextmanager

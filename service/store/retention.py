@@ -51,7 +51,7 @@ def forget(
 ) -> RetentionResult:
     """Delete what is past the limits.  One-hour roll-ups and alarms stay.
 
-    keep: told of windows, by their conditions, before they are deleted.
+    keep: called with windows, by their conditions, before they are deleted.
     """
     if connection.dialect.name == "postgresql":
         connection.execute(text("SET LOCAL statement_timeout = 0"))  # a month of a fleet takes its time
