@@ -33,7 +33,9 @@ from sprung.model.identification.noise_share import mean_share, noise_share
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
-IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
+# A log-ratio less certain than this is reported as not identifiable: its 95 % interval spans a factor of 1.8 to each
+# side, so that half the nominal value cannot be told from nearly all of it
+IDENTIFIABLE_STD = 0.3
 WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
 NOISE_SHARE = 0.15  # of a sensitivity's power, at most
 VAGUE_SHARE = (
