@@ -27,9 +27,9 @@ from sprung.model.diagnosis.investigation.setup_effects import (
     SetupEffect,
     SetupPlace,
 )
-from sprung.model.diagnosis.investigation.setup_hypotheses import hypotheses
+from sprung.model.diagnosis.investigation.setup_hypotheses import Wiring, hypotheses
 from sprung.model.diagnosis.investigation.setup_onset import begins_backwards, driving_point, velocity_of
-from sprung.model.diagnosis.investigation.setup_response import ModelResponse
+from sprung.model.diagnosis.investigation.setup_response import Group, ModelResponse
 from sprung.model.diagnosis.investigation.setup_scores import SetupScores
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
 from sprung.model.diagnosis.record.channels import DiagnosisError
@@ -232,9 +232,10 @@ def _reversed_by_onset(
     velocity = velocity_of(part, system.mechanics.sensor_kind[beside], i)
     if not begins_backwards(part.grid.inverse(part.force[:, 0]), velocity, part.grid.compared, problem.rules.setup):
         return None
-    turned = [(SetupPlace(force, detail=force), changes.turn(forces=[0]))]
+    wired = Wiring(system, signals)
+    turned = [(wired.site(Group(forces=(0,))), changes.turn(forces=[0]))]
     if len(problem.sensors) > 1:  # a single sensor cannot tell which of the two is turned
-        turned.append((SetupPlace(signals.sensor_names[i], detail=force), changes.turn(sensors=[i])))
+        turned.append((wired.site(Group((i,))), changes.turn(sensors=[i])))
     fitted, total = [], total_misfit(fit)
     for site, undo in turned:
         _, corrected = undo(system, signals)
@@ -242,7 +243,8 @@ def _reversed_by_onset(
             other, better = _fitted(system, corrected, declared, split, problem)
         except DiagnosisError:
             continue
-        fault = SetupFault(SIGN_REVERSED_BY_ONSET, site, None, 0.0, total, total_misfit(better))
+        place = replace(site, detail=force)
+        fault = SetupFault(SIGN_REVERSED_BY_ONSET, place, None, 0.0, total, total_misfit(better))
         fitted.append(_FittedFault(fault, system, corrected, split, other, better))
     return min(fitted, key=_after, default=None)
 

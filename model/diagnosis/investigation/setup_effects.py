@@ -28,6 +28,7 @@ class SetupPlace:
     group: Group = NOTHING  # the channels that share it
     axis: int = 0  # of a position: x or y
     detail: str = ""  # in words: where an element belongs
+    inverse_at: str = ""  # channels joined by "|", at which the inverse fault gives the same recording
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class SetupEffect:
 
     name: str  # a word of the contract
     sentence: str = ""  # with {place}, {value}, {axis}, {detail}
+    inverse: str = ""  # what else gives the same recording, with {channels}; empty: nothing
     parameter: tuple[str, str] | None = None  # name and unit of its value
     relative: bool = False  # the remaining fault is a share of its value
     ordinary: bool = False  # a fault of one sensor that screening tests: here only a rival
@@ -70,8 +72,9 @@ class SetupEffect:
 
     def describe(self, site: SetupPlace, value: str) -> str:
         """In words."""
-        place = site.location.replace("|", " and ")
-        return self.sentence.format(place=place, value=value, axis="xy"[site.axis], detail=site.detail)
+        place, channels = (location.replace("|", " and ") for location in (site.location, site.inverse_at))
+        sentence = self.sentence.format(place=place, value=value, axis="xy"[site.axis], detail=site.detail)
+        return f"{sentence}; {self.inverse.format(channels=channels)}" if self.inverse and channels else sentence
 
 
 @dataclass(frozen=True)
@@ -126,26 +129,30 @@ def _moved(
         return fitted.scores.of_system(move(fitted.system, site.location, site.axis, NEAR)), NEAR
 
     words = "{place}: sits {value} along {axis} from where the system file says"
-    return SetupEffect(name, words, ("offset", "m"), undo=undo, remaining=remaining, law=law)
+    return SetupEffect(name, words, parameter=("offset", "m"), undo=undo, remaining=remaining, law=law)
 
 
-SIGN_REVERSED = SetupEffect("sign_reversed", "{place}: the sign is reversed")
+SIGN_REVERSED = SetupEffect(
+    "sign_reversed", "{place}: the sign is reversed", inverse="{channels} reversed instead gives the same recording"
+)
 SIGN_REVERSED_BY_ONSET = SetupEffect(
     SIGN_REVERSED.name,
     "{place}: the sign is reversed, for as recorded {detail} first moves its own point backwards",
+    SIGN_REVERSED.inverse,
     model_free=True,
 )
 CHANNELS_SWAPPED = SetupEffect("channels_swapped", "{place}: exchanged")
 NODE_DELAY = SetupEffect(
     "node_delay",
     "{place}: all of them are late by {value}, as a whole node is",
-    ("time", "s"),
+    parameter=("time", "s"),
     undo=_advanced,
     remaining=_late,
 )
 WRONG_SCALE = SetupEffect(
     "wrong_scale",
     "{place}: {value} times what it should show, a wrong scale or unit",
+    "{channels} off by the inverse instead gives the same recording",
     ("ratio", "1"),
     relative=True,
     undo=_rescaled,

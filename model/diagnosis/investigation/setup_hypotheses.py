@@ -70,6 +70,21 @@ class Wiring:
             names += [f"{support}.{quantity}" for quantity in self._measured(support)]
         return "|".join([*names, *(self.signals.force_names[k] for k in group.forces)])
 
+    def site(self, group: Group, location: str = "") -> SetupPlace:
+        """A group of channels as the place of a fault of theirs; location: its name, by default that of its channels.
+
+        A linear system answers all inputs times a factor with all sensors times this factor.
+        """
+        sensors, supports, forces = (tuple(range(n)) for n in self._counts)
+        every, inputs = Group(sensors), Group((), supports, forces)
+        inverse = {every: inputs, inputs: every}.get(group, Group())
+        return SetupPlace(location or self.name(group), group, inverse_at=self.name(inverse))
+
+    @property
+    def _counts(self) -> tuple[int, int, int]:
+        """Numbers of sensors, supports and measured forces."""
+        return len(self.sensors), len(self.signals.support_names), len(self.signals.force_names)
+
     def _measured(self, support: str) -> tuple[str, ...]:
         source = self.system.file.inputs[support]
         return tuple(source.measured) if isinstance(source, SupportInput) else ()
@@ -139,15 +154,14 @@ class Wiring:
 
 def _signs(one: ModelResponse, signals: Signals, wired: Wiring) -> Iterator[Hypothesis]:
     for group in wired.groups():
-        name = wired.name(group)
-        if len(group.supports) == 1 and not group.sensors:
-            name = signals.support_names[group.supports[0]]
+        name = signals.support_names[group.supports[0]] if len(group.supports) == 1 and not group.sensors else ""
         misfit = one.misfit(one.turned(group))
         undo, alone = changes.turn(group.sensors, group.supports), len(group.sensors) + len(group.supports) == 1
-        yield Hypothesis(SIGN_REVERSED, SetupPlace(name, group), None, misfit, undo, unranked=alone)
-    for j, name in enumerate(signals.force_names):
+        yield Hypothesis(SIGN_REVERSED, wired.site(group, name), None, misfit, undo, unranked=alone)
+    for j in range(len(signals.force_names)):
         misfit = one.misfit(one.predicted - 2 * one.of_force[:, :, j])
-        yield Hypothesis(SIGN_REVERSED, SetupPlace(name), None, misfit, changes.turn(forces=[j]), unranked=True)
+        site = wired.site(Group(forces=(j,)))
+        yield Hypothesis(SIGN_REVERSED, site, None, misfit, changes.turn(forces=[j]), unranked=True)
 
 
 def _exchanges(one: ModelResponse, system: System, signals: Signals, wired: Wiring) -> Iterator[Hypothesis]:
@@ -210,7 +224,7 @@ def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
             continue  # the others are in g: they show less by as much
         if np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale):
             misfit = one.misfit(one.scaled(group, ratio))
-            yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, misfit)
+            yield Hypothesis.of(WRONG_SCALE, wired.site(group), ratio, misfit)
 
 
 def _is_gravity(ratio: float, rules: SetupRules) -> bool:
@@ -244,7 +258,7 @@ def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Ite
     ratio = ratio if group is sensors else 1 / ratio
     if inert.misfit(inert.scaled(group, ratio)) < rules.by_mass * before:
         misfit = one.misfit(one.scaled(group, ratio))
-        yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, misfit, by_mass=True)
+        yield Hypothesis.of(WRONG_SCALE, wired.site(group), ratio, misfit, by_mass=True)
 
 
 def _positions(one: ModelResponse, system: System, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:

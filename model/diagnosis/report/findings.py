@@ -185,6 +185,7 @@ def _setup_finding(fault: SetupFault) -> Finding:
         parameters=parameters,
         p_value=None,
         delta_bic=None,
+        elsewhere=(fault.site.inverse_at,) if fault.site.inverse_at and fault.effect.inverse else (),
         sentence=f"{sentence}{gone}",
     )
 

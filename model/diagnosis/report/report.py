@@ -110,7 +110,8 @@ class Finding:
     runner_up: tuple[str, float] | None = None  # (effect, delta_bic) of the next best law
     runner_up_location: str | None = None
     family: str | None = None  # of look-alikes, if none of them is clearly better
-    elsewhere: tuple[str, ...] = ()  # other places at which the same law does almost equally well
+    # other places at which the same law, or the inverse fault of the set-up, explains the recording equally well
+    elsewhere: tuple[str, ...] = ()
     advice: str | None = None  # experiment that would distinguish the look-alikes
     sentence: str = ""
     quoted: tuple[LawParameter, ...] = ()  # derived values: yield force, loop area, forces at given rates

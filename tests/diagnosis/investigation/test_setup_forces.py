@@ -104,6 +104,15 @@ def test_a_wrong_set_up_under_a_measured_force_is_named(
         assert first.parameters[0].value == pytest.approx(value, rel=0.01)
 
 
+@pytest.mark.parametrize("kind", ["kN", pytest.param("g", marks=pytest.mark.slow)])
+def test_where_the_inverse_fault_gives_the_same_recording_it_is_named_too(kind: str) -> None:
+    """A linear structure answers a thousand times the force with a thousand times the motion."""
+    (first,) = diagnose(parse_system(TOWER), ShakerTest(wrong(tower(), kind))).findings
+    other = {"kN": "a1|a2|a3", "g": "shaker"}[kind]
+    assert first.elsewhere == (other,)
+    assert f"{other.replace('|', ' and ')} off by the inverse instead gives the same recording" in first.sentence
+
+
 @pytest.mark.slow
 def test_of_many_hypotheses_those_are_fitted_that_explain_a_stretch() -> None:
     short = Options(rules=RULES.varied("setup", "stretch", 700))
