@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress, share_done
 from sprung.model.diagnosis.selection.compete import cost, noise_bound
 from sprung.model.diagnosis.selection.evidence import profile_gain
 
@@ -27,7 +27,7 @@ def with_named_laws(
     last = unnamed.found[-1]
     if unnamed.problem.process_noise or _needs_no_names(unnamed):
         return unnamed
-    progress(0.3 + 0.17 * len(before.found), "named laws in place of an unnamed force")
+    progress(share_done(len(before.found) + 0.5), "named laws in place of an unnamed force")
     named = search(replace(before, options=replace(before.options, unnamed=False)))
     if len(named.found) <= len(before.found) or not _explains_as_much(before, unnamed, named):
         return unnamed

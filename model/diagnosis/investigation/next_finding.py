@@ -19,7 +19,7 @@ from sprung.model.diagnosis.investigation.calibration import (
 from sprung.model.diagnosis.investigation.formula_trial import with_formula
 from sprung.model.diagnosis.investigation.masses import imitates_errors
 from sprung.model.diagnosis.investigation.minor import is_minor, sought, untried
-from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress, share_done
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.investigation.widened import (
     adopt_wider,
@@ -34,7 +34,7 @@ from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.plausible import doubt, hardly_there
 
-_BEGUN, _SHARE = 0.25, 0.17  # of the whole progress: before the first finding, and for each
+_FITTED, _CHECKED = 0.5, 0.7  # of one finding's work
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,14 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
         return next_finding(adopt_wider(state, wide), number, progress)
     if not candidates:
         return state
-    share = _BEGUN + _SHARE * number
-    competition = _competition(state, candidates, lambda text: progress(share, text))
+    competition = _competition(state, candidates, lambda text: progress(share_done(number), text))
     state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in competition.implausible)))
     if wide is not None and is_better(state, wide, competition.leading):
         return next_finding(adopt_wider(state, wide), number, progress)
     if not competition.leading:
         return state
-    progress(share + _SHARE / 2, f"checking {competition.leading[0].term.location}")
-    return _with_leading(state, competition, lambda text: progress(share + 0.7 * _SHARE, text))
+    progress(share_done(number + _FITTED), f"checking {competition.leading[0].term.location}")
+    return _with_leading(state, competition, lambda text: progress(share_done(number + _CHECKED), text))
 
 
 def _with_leading(state: Investigation, competition: _Competition, progress: Callable[[str], None]) -> Investigation:

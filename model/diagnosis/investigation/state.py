@@ -23,6 +23,13 @@ from sprung.model.system import System
 from sprung.model.work import WorkBudget
 
 Progress = Callable[[float, str], None]  # share done, next step in words
+_BEGUN, _SOUGHT = 0.25, 0.92  # share done before the first finding is sought, and after the last one
+_NO_FURTHER = 0.25  # odds assumed that a finding is the last
+
+
+def share_done(findings: float) -> float:
+    """Share of an investigation that is done once so many findings are made, of a number that nobody knows."""
+    return _SOUGHT - (_SOUGHT - _BEGUN) * (1 - _NO_FURTHER) ** findings
 
 
 class Recorded(Protocol):

@@ -10,6 +10,7 @@ import pytest
 
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.fit.optimise import try_optimise
+from sprung.model.diagnosis.investigation.state import share_done
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.selection import compete
 from sprung.model.work import WorkBudget
@@ -60,3 +61,8 @@ def test_where_a_search_ends_does_not_depend_on_which_thread_is_first(monkeypatc
         report = diagnose(system, record, Options(work=work))
         ends.append((report.to_dict(), work.done))
     assert ends[0] == ends[1] == ends[2] and work.ended
+
+
+def test_the_share_done_grows_with_every_finding_and_ends_before_the_conclusion() -> None:
+    shares = [share_done(findings) for findings in (0, 0.5, 1, 2, 6, 20)]
+    assert shares[0] == 0.25 and shares == sorted(shares) and shares[-1] < 0.93
