@@ -264,6 +264,14 @@ class Restart(NamedTuple):
     parameters: tuple[float, ...]
 
 
+class Restatement(NamedTuple):
+    """Another law that has the same force beside another spring and damper."""
+
+    law: ElementLaw
+    parameters: tuple[float, ...]
+    element: SpringDamper
+
+
 def empty_memory(motion: Motion, p: Values, element: SpringDamper) -> Any:
     """A memory that knows nothing of the time before the recording."""
     return 0.0
@@ -318,6 +326,9 @@ class ElementLaw(Parametrised):
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
     # Of a wider law that is tried in place of the narrower one once that is found: starts, from that one's values
     widened: Callable[[Values, Observed], Sequence[Values]] | None = None
+    # Other laws with the same force beside another spring and damper than its values and its element's: where the one
+    # beside it is far from nominal, they are tried in its place
+    restated: Callable[[Values, SpringDamper], tuple[Restatement, ...]] | None = None
     # Variants with the same parameters, sought as well; those of either direction may stand beside each other
     forms: tuple[tuple[str, ElementLaw], ...] = ()
     formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down

@@ -15,6 +15,7 @@ from sprung.model.laws.base import (
     Motion,
     Observed,
     ParameterSpec,
+    Restatement,
     SpringDamper,
     Values,
     grid,
@@ -217,3 +218,13 @@ CLEARANCE = ElementLaw(
     sentence="the spring has a clearance of {gap} to each side before it acts",
     strength=None,
 )
+
+
+def _lost_motion(p: Values, element: SpringDamper) -> tuple[Restatement, ...]:
+    """Stops of a spring that has nearly none before them: the spring begins at them."""
+    gap, stiffness = (float(np.mean(values)) for values in (p[::2], p[1::2]))  # of both sides
+    return (Restatement(CLEARANCE, (gap,), SpringDamper(element.stiffness + stiffness, element.damping)),)
+
+
+if BUMP_STOP.wider is not None:
+    BUMP_STOP = replace(BUMP_STOP, restated=_lost_motion, wider=replace(BUMP_STOP.wider, restated=_lost_motion))

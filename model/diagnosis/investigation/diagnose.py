@@ -20,6 +20,7 @@ from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covari
 from sprung.model.diagnosis.investigation.named_laws import with_laws_together, with_named_laws
 from sprung.model.diagnosis.investigation.next_finding import next_finding
 from sprung.model.diagnosis.investigation.redundant import without_redundant
+from sprung.model.diagnosis.investigation.restated import restated
 from sprung.model.diagnosis.investigation.setup import fitted_samples, without_setup_faults
 from sprung.model.diagnosis.investigation.setup_effects import Hypothesis
 from sprung.model.diagnosis.investigation.significance import (
@@ -76,7 +77,7 @@ def with_findings(state: Investigation, progress: Progress) -> Investigation:
         if len(state.found) == len(before.found):
             return with_laws_together(state, lambda plain: with_findings(plain, progress))
         state = with_named_laws(before, state, lambda plain: with_findings(plain, progress), progress)
-        state = without_redundant(state)
+        state = restated(without_redundant(state))
         if _still_rejected(state, before.fit) or another_structure(state):
             break  # further findings would only imitate another structure
         if common_delay(state) is not None:

@@ -19,12 +19,13 @@ from sprung.model.diagnosis.investigation.calibration import (
 from sprung.model.diagnosis.investigation.formula_trial import with_formula
 from sprung.model.diagnosis.investigation.masses import imitates_errors
 from sprung.model.diagnosis.investigation.minor import is_minor, sought, untried
-from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress, share_done
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress, WidenedFit, share_done
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.investigation.widened import (
     adopt_wider,
     best_wider,
     is_better,
+    rivals_of_wider,
     share_an_element,
     with_wider_rivals,
     with_wider_tried,
@@ -46,6 +47,16 @@ class _Competition:
     leading: list[Trial]  # the findings in order of preference
     implausible: list[tuple[Trial, str]]  # of more evidence than any finding, with the reason for doubt
 
+    def before(self, other: _Competition) -> _Competition:
+        """This one, whose leading trial is the best of both, with the trials of another one behind it."""
+        best = self.leading[0].evidence
+        return _Competition(
+            [*self.believed, *other.believed],
+            [*self.findings, *other.findings],
+            [*self.leading, *other.leading],
+            [*self.implausible, *((trial, reason) for trial, reason in other.implausible if trial.evidence > best)],
+        )
+
 
 def next_finding(state: Investigation, number: int, progress: Progress) -> Investigation:
     """The investigation with one more finding; without one if the residual is noise or no candidate is accepted."""
@@ -55,13 +66,20 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
     wide = best_wider(state)
     promised = max((candidate.score for candidate in candidates), default=0.0)
     if wide is not None and wide.fall > promised and is_better(state, wide, []):
-        return next_finding(adopt_wider(state, wide), number, progress)
-    if not candidates:
+        candidates = []
+    elif not candidates:
         return state
-    competition = _competition(state, candidates, lambda text: progress(share_done(number), text))
-    state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in competition.implausible)))
+
+    def told(text: str) -> None:
+        progress(share_done(number), text)
+
+    competition = _competition(state, candidates, told)
     if wide is not None and is_better(state, wide, competition.leading):
-        return next_finding(adopt_wider(state, wide), number, progress)
+        beside = _beside_narrow(state, wide, candidates, told)
+        if is_better(state, wide, beside.leading):
+            return next_finding(adopt_wider(state, wide), number, progress)
+        competition = beside.before(competition)
+    state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in competition.implausible)))
     if not competition.leading:
         return state
     progress(share_done(number + _FITTED), f"checking {competition.leading[0].term.location}")
@@ -76,14 +94,14 @@ def _with_leading(state: Investigation, competition: _Competition, progress: Cal
     """
     trials, note = with_formula(state, competition.findings, competition.leading)
     chosen = trials[0]
-    p_value = _p_value(state, chosen)
-    if _is_refuted(state, chosen) or p_value > state.options.rules.acceptance.alpha:
+    if not _is_acceptable(state, chosen):
         return state
     if state.calibrations is None and (may_be_calibration(state, chosen.term) or imitates_errors(state, chosen)):
         state = calibrated(state, chosen.term)
         if state.calibrations:
             return state
     second = runner_up(state.problem, state.fit, untried(state, state.last.candidates), chosen, competition.believed)
+    p_value = _p_value(state, chosen)
     state, trial = _refitted(state, chosen, trials)
     rivals = tuple(t for t in trials if t is not trial)
     found = AcceptedFinding(trial, rivals, second, p_value, tuple(t for t, _ in competition.implausible))
@@ -103,14 +121,25 @@ def _candidates(state: Investigation) -> list[Candidate]:
     return untried(state, shortlist(screening, rules.acceptance.alpha, options.multiplicity, rules, gross=gross))
 
 
-def _competition(state: Investigation, candidates: list[Candidate], progress: Callable[[str], None]) -> _Competition:
-    """All candidates fitted, and which of them are findings."""
+def _competition(
+    state: Investigation,
+    candidates: list[Candidate],
+    progress: Callable[[str], None],
+    instead: WidenedFit | None = None,
+) -> _Competition:
+    """All candidates fitted, and which of them are findings.
+
+    instead: the wider form of a law that would be adopted without them; what explains more is no inaccuracy of it.
+    """
+    if not candidates:
+        return _Competition([], [], [], [])
     rules = state.options.rules
     tried = with_wider_rivals(state, compete(state.problem, state.fit, candidates, progress))
     doubts = [(trial, doubt(trial.fit, trial.term, rules.plausible, before=state.fit)) for trial in tried]
     believed = [trial for trial, reason in doubts if reason is None]
-    present = [trial for trial in tried if not hardly_there(trial.fit, rules.plausible)]
-    worthy = [t for t in present if t.finished and t.evidence > 0 and not is_minor(state, t)]
+    present = [trial for trial in tried if trial.finished and not hardly_there(trial.fit, rules.plausible)]
+    beyond = np.inf if instead is None else instead.evidence
+    worthy = [t for t in present if t.evidence > 0 and (t.evidence > beyond or not is_minor(state, t))]
     findings = [t for t in worthy if _contains(believed, t)]
     leading = preferred(findings, rules.selection)
     leading.sort(key=lambda t: t.candidate.family.rank)  # faults of the inputs first, of forces as of motions
@@ -119,9 +148,24 @@ def _competition(state: Investigation, candidates: list[Candidate], progress: Ca
     return _Competition(believed, findings, leading, implausible)
 
 
+def _beside_narrow(
+    state: Investigation, wide: WidenedFit, tried: list[Candidate], progress: Callable[[str], None]
+) -> _Competition:
+    """The competition of second laws at the element of a law that would be widened, without those tried before."""
+    known = {candidate.term.key for candidate in tried}
+    rivals = [rival for rival in rivals_of_wider(state, wide) if rival.term.key not in known]
+    beside = _competition(state, rivals, progress, wide)
+    return replace(beside, leading=[trial for trial in beside.leading if _is_acceptable(state, trial)])
+
+
 def _contains(trials: list[Trial], trial: Trial) -> bool:
     """Whether a list contains this very trial: fits are compared by identity."""
     return any(trial is one for one in trials)
+
+
+def _is_acceptable(state: Investigation, trial: Trial) -> bool:
+    """Whether a trial is neither chance nor refuted by the held-out part."""
+    return _p_value(state, trial) <= state.options.rules.acceptance.alpha and not _is_refuted(state, trial)
 
 
 def _p_value(state: Investigation, chosen: Trial) -> float:

@@ -14,12 +14,14 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.minor import untried
 from sprung.model.diagnosis.investigation.state import Investigation, TriedWider, WidenedFit
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.along_measured import MeasuredMotion
-from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete, noise_bound
+from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete, noise_bound, shortlist
 from sprung.model.diagnosis.selection.evidence import occam_cost, profile_gain
+from sprung.model.diagnosis.selection.matched import matched_starts
 from sprung.model.diagnosis.selection.plausible import doubt
 from sprung.model.diagnosis.selection.starts import wider_starts
 from sprung.model.laws import ElementLaw
@@ -65,6 +67,20 @@ def is_better(state: Investigation, wide: WidenedFit, trials: list[Trial]) -> bo
         return False
     held_out = state.options.held_out and not state.held.still
     return not (held_out and state.held.compare(state.fit, wide.fit).refuted)
+
+
+def rivals_of_wider(state: Investigation, wide: WidenedFit) -> list[Candidate]:
+    """Laws that may explain as much beside the narrow form at its element as the wider form does.
+
+    Plain friction beside a valve is nearly the force of a friction that changes with the rate.  Scores of such laws are
+    far below those elsewhere, since the narrow law and the damper have absorbed most of what they would explain.
+    """
+    place, options = wide.fit.point.terms[wide.index].location, state.options
+    here = [one for one in untried(state, state.last.candidates) if one.location == place and one.term.law.named]
+    alone = replace(state.last, candidates=tuple(here))
+    close = shortlist(alone, options.rules.acceptance.alpha, options.multiplicity, options.rules)
+    starts = {one: matched_starts(state.problem, state.fit, wide.fit, wide.index, one) for one in close}
+    return [*close, *(replace(one, start=start) for one, more in starts.items() for start in more)]
 
 
 def adopt_wider(state: Investigation, wide: WidenedFit) -> Investigation:
