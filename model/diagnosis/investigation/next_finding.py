@@ -48,8 +48,8 @@ class _Competition:
     implausible: list[tuple[Trial, str]]  # of more evidence than any finding, with the reason for doubt
 
     def before(self, other: _Competition) -> _Competition:
-        """This one, whose leading trial is the best of both, with the trials of another one behind it."""
-        best = self.leading[0].evidence
+        """This one, whose leading trial is the best of both if it has one, with the trials of another one behind it."""
+        best = self.leading[0].evidence if self.leading else -np.inf
         return _Competition(
             [*self.believed, *other.believed],
             [*self.findings, *other.findings],
@@ -74,12 +74,14 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
         progress(share_done(number), text)
 
     competition = _competition(state, candidates, told)
-    if wide is not None and is_better(state, wide, competition.leading):
+    widened = wide is not None and is_better(state, wide, competition.leading)
+    if wide is not None and widened:
         beside = _beside_narrow(state, wide, candidates, told)
-        if is_better(state, wide, beside.leading):
-            return next_finding(adopt_wider(state, wide), number, progress)
+        widened = is_better(state, wide, beside.leading)
         competition = beside.before(competition)
     state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in competition.implausible)))
+    if wide is not None and widened:
+        return next_finding(adopt_wider(state, wide), number, progress)
     if not competition.leading:
         return state
     progress(share_done(number + _FITTED), f"checking {competition.leading[0].term.location}")
