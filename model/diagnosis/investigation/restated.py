@@ -61,16 +61,20 @@ def _restatements(problem: Problem, base: Fit, index: int) -> Iterator[Point]:
     law = term.law
     if not isinstance(law, ElementLaw) or law.restated is None or any(term.fixed):
         return
-    names = [p.name for p in problem.system.parameters]
-    own = {quantity: f"{term.location}.{quantity}" for quantity in ("stiffness", "damping")}
-    places = [names.index(name) for name in own.values() if name in names]
-    if len(places) < len(own) or np.max(np.abs(base.point.theta[places])) <= problem.rules.selection.far:
+    at = {p.name: index for index, p in enumerate(problem.system.parameters)}
+    own = [at.get(f"{term.location}.{quantity}") for quantity in ("stiffness", "damping")]
+    away = [abs(base.point.theta[place]) for place in own if place is not None]
+    if max(away, default=0.0) <= problem.rules.selection.far:
         return
     element = SpringDamper(*(float(value) for value in base.forward.element_of(term)))
     for other in law.restated(term.parameters, element):
         theta = base.point.theta.copy()
-        theta[places] += np.log(np.array(other.element) / np.array(element))
-        yield _started(base, index, other, theta)
+        changes = [one for one in zip(own, other.element, element, strict=True) if one[1] != one[2]]
+        for place, new, old in changes:
+            if place is not None:
+                theta[place] += np.log(new / old)
+        if all(place is not None for place, *_ in changes):  # what the file fixes is no other spring
+            yield _started(base, index, other, theta)
 
 
 def _started(base: Fit, index: int, other: Restatement, theta: np.ndarray) -> Point:
