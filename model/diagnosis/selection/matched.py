@@ -19,7 +19,7 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.diagnosis.selection.starts import restarts_of, start_of
+from sprung.model.diagnosis.selection.starts import start_of
 from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
@@ -65,13 +65,11 @@ class _ShownForce:
             terms.append(term.at(term.element_law.clip(found)))
         return element, tuple(terms)
 
-    def internal(self, damping: float, second: FloatArray) -> FloatArray:
-        """Internal values at a factor of the damper and values of the second law."""
-        first, other = self.terms
-        values = [np.log(damping)] if self.free[1] else []
-        values = [0.0, *values] if self.free[0] else values
-        for term, parameters in ((first, first.parameters), (other, tuple(second))):
-            for spec, value, scale in zip(term.law.parameters, parameters, term.scales, strict=True):
+    def internal(self, damping: float) -> FloatArray:
+        """Internal values of the laws as they are, at a factor of the damper."""
+        values = [value for value, free in zip((0.0, np.log(damping)), self.free, strict=True) if free]
+        for term in self.terms:
+            for spec, value, scale in zip(term.law.parameters, term.parameters, term.scales, strict=True):
                 values.append(float(np.log(value)) if spec.log else value / scale)
         return np.array(values)
 
@@ -89,7 +87,7 @@ def matched_starts(problem: Problem, base: Fit, shown: Fit, index: int, candidat
     places = [names.index(one) if one in names else None for one in _own(first.location)]
     force = _shown(base, shown, index, candidate.term, (places[0] is not None, places[1] is not None))
     known: list[float] = []  # dampings
-    for x in sorted(_fits(problem, base, force, candidate), key=lambda x: float(np.sum(force.left(x) ** 2))):
+    for x in sorted(_fits(problem, force, candidate), key=lambda x: float(np.sum(force.left(x) ** 2))):
         element, (one, other) = force.at(x)
         if any(abs(np.log(element.damping / damping)) < _ALIKE for damping in known):
             continue
@@ -119,17 +117,11 @@ def _shown(base: Fit, shown: Fit, index: int, second: Term, free: tuple[bool, bo
     return _ShownForce(d[thin], v[thin], time, force[thin], element, free, (base.point.terms[index], second))
 
 
-def _fits(problem: Problem, base: Fit, force: _ShownForce, candidate: Candidate) -> list[FloatArray]:
-    """Internal values of the two laws fitted to a force, from different dampers and values of the second law."""
-    starts = [(1.0, candidate.term.parameters)]
-    starts += [(restart.damping, restart.parameters) for restart in restarts_of(problem, base, candidate)]
+def _fits(problem: Problem, force: _ShownForce, candidate: Candidate) -> list[FloatArray]:
+    """Internal values of the two laws fitted to a force, from the damper as it is read and from the nominal one."""
     name = _own(candidate.location)[1]
-    starts += [
-        (p.nominal / force.element.damping, candidate.term.parameters)
-        for p in problem.system.parameters
-        if p.name == name
-    ]
+    nominal = [p.nominal / force.element.damping for p in problem.system.parameters if p.name == name]
     with np.errstate(all="ignore"):
-        begun = [force.internal(damping, np.array(parameters)) for damping, parameters in starts]
+        begun = [force.internal(damping) for damping in (1.0, *nominal)]
         fits = [least_squares(force.left, x, max_nfev=_EVALUATIONS) for x in begun if np.all(np.isfinite(x))]
     return [fit.x for fit in fits if np.all(np.isfinite(fit.x))]

@@ -69,10 +69,18 @@ def structure_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[
 
 def _further_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
     """Initial values with an element's stiffness or damping other than estimated without the law."""
-    names, start = [p.name for p in problem.system.parameters], start_of(base, candidate)
+    law, names = candidate.term.law, [p.name for p in problem.system.parameters]
     at = {quantity: f"{candidate.location}.{quantity}" for quantity in ("stiffness", "damping")}
+    if not isinstance(law, ElementLaw) or at["damping"] not in names:
+        return []
+    start = start_of(base, candidate)
+    restarts = () if law.restarts is None else law.restarts(_reading(problem, base, candidate.location))
+    if candidate.beyond > 1.0:  # a law proportional to the damper that exceeds it: the damper is stronger
+        stronger = problem.rules.selection.stronger
+        values = law.scaled(candidate.term.parameters, 1 / stronger)
+        restarts += (Restart(1.0, stronger * candidate.beyond, tuple(values)),)
     points = []
-    for restart in restarts_of(problem, base, candidate):
+    for restart in restarts:
         theta = start.theta.copy()
         for quantity, factor in (("stiffness", restart.stiffness), ("damping", restart.damping)):
             if at[quantity] in names:
@@ -80,19 +88,6 @@ def _further_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[P
         term = candidate.term.at(np.array(restart.parameters))
         points.append(replace(start, theta=theta, terms=(*base.point.terms, term)))
     return points
-
-
-def restarts_of(problem: Problem, base: Fit, candidate: Candidate) -> tuple[Restart, ...]:
-    """Other values of a candidate's law beside its element otherwise than estimated without it."""
-    law, names = candidate.term.law, [p.name for p in problem.system.parameters]
-    if not isinstance(law, ElementLaw) or f"{candidate.location}.damping" not in names:
-        return ()
-    restarts = () if law.restarts is None else law.restarts(_reading(problem, base, candidate.location))
-    if candidate.beyond > 1.0:  # a law proportional to the damper that exceeds it: the damper is stronger
-        stronger = problem.rules.selection.stronger
-        values = law.scaled(candidate.term.parameters, 1 / stronger)
-        restarts += (Restart(1.0, stronger * candidate.beyond, tuple(values)),)
-    return restarts
 
 
 def _reading(problem: Problem, base: Fit, location: str) -> FittedElement:
