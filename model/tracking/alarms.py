@@ -311,7 +311,7 @@ class Attribution:
         name = self.sensor_name(jump.direction, jump.kind)
         if any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):
             return alarms
-        alarm = Alarm("sensor", name, jump.since, now, "warning", jump.size, None, jump.size)
+        alarm = Alarm("sensor", name, jump.since, now, "warning", jump.size, jump.std, jump.size)
         return [*alarms, alarm]
 
     def _drifted(self, state: TrackerState) -> list[MeasurementFault]:
@@ -355,11 +355,9 @@ class Attribution:
         others = ~np.isin(np.arange(H), members)
         off = float(np.mean((away - self.model.common_value(away, others))[members]))
         own = self.model.relative_std(state.belief.covariance[-H:, -H:])[members]
-        # The reference is as uncertain as the present value, or wrong by a drift that is not detected yet.
-        undetected = self.model.rules.drifted / 3 * self.model.drift_limit[members]
-        of_reference = np.where(state.calibration.moved[members] > 0, own, undetected)
+        variance = dev.change_variance(state.calibration, self.model, state.belief)
         known = float(np.sqrt(np.mean(own**2)))
-        spread = float(np.mean(own**2 + of_reference**2 + dev.pending_variance(state.calibration, self.model)[members]))
+        spread = float(np.mean((variance + dev.pending_variance(state.calibration, self.model))[members]))
         linear = float(dev.linearisation_std(np.asarray(off))) if kind == "gain" else 0.0
         std = float(np.hypot(np.sqrt(spread), linear))
         recovered = self._rules.sensor_recovered * abs(alarm.peak or 0.0)

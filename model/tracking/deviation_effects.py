@@ -90,9 +90,7 @@ class DeviationEffects:
         """Variance (P,) from deviations that are not the same in this window as in those of the baseline."""
         return self.variance(belief, cross, (calibration.moved > 0) | self.model.cargo)
 
-    def baseline_shift(
-        self, state: TrackerState, calibration: dev.DeviationRecord, cross: FloatArray, belief: kalman.Belief
-    ) -> FloatArray:
+    def baseline_shift(self, state: TrackerState, calibration: dev.DeviationRecord, cross: FloatArray) -> FloatArray:
         """Contribution (P,) of the reference deviations to the baseline; loads are corrected window by window.
 
         A baseline is learned with gains and delays as the system file states them, and compared at the reference.
@@ -102,13 +100,7 @@ class DeviationEffects:
         stays = ~self.model.cargo
         learned = state.changes.learned >= self.settings.learning
         reference = np.where(stays, calibration.reference, 0.0)
-        # One that is learned anew starts from what is known of the deviations by now.
-        here = np.where(stays, belief.mean[-self.model.size :], 0.0) if self._refining(state) else reference
-        return np.where(learned, calibration.base_cross @ reference, cross @ here)
-
-    def _refining(self, state: TrackerState) -> bool:
-        """Whether the reference of the baseline is still being refined."""
-        return (state.used + 1) * self.settings.hop < dev.REFERENCE_TIME
+        return np.where(learned, calibration.base_cross @ reference, cross @ reference)
 
     def learned(
         self,
@@ -116,29 +108,16 @@ class DeviationEffects:
         tested: change_test.Changes,
         calibration: dev.DeviationRecord,
         cross: FloatArray,
-        belief: kalman.Belief,
-        *,
-        armed: bool,
-        settled: bool,
     ) -> dev.DeviationRecord:
-        """Record with sensitivities and reference of the baseline after a window.
-
-        armed: the baseline is known; settled: no deviation is jumping.
-        """
+        """Record with the sensitivities of the baseline after a window."""
         if not self.model.size:
             return calibration
         first = state.changes.learned < self.settings.learning  # later refinements use corrected windows
         more = (tested.weight - state.changes.weight) / np.maximum(tested.weight, 1e-300)
         gained = np.where(first & (tested.weight > 0), more, 0.0)
-        base = calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
-        calibration = replace(calibration, base_cross=base)
-        if self._refining(state) and armed and not settled:
-            return calibration
-        if self._refining(state):
-            return dev.update_reference(calibration, self.model, belief, ~self.model.cargo & armed)
-        # Constants of bodies never change: the baseline was learned with those that are known by now.
-        constants = np.where(self.model.constant, belief.mean[-self.model.size :], calibration.reference)
-        return replace(calibration, reference=constants)
+        return replace(
+            calibration, base_cross=calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
+        )
 
 
 def _with_cross_error(covariance: FloatArray, shift: FloatArray) -> FloatArray:

@@ -55,12 +55,35 @@ class DeviationModel:
             out[at] = median(values[chosen])
         return out
 
-    def relative_std(self, covariance: FloatArray) -> FloatArray:
-        """Standard deviations (H,) of deviations less the mean of their group, from their covariance (H, H).
+    def relative_variance(self, covariance: FloatArray) -> FloatArray:
+        """Variances (H,) of gains and delays less the median of the others of their group; own ones of the rest.
 
-        The delay common to all clocks may be uncertain by milliseconds while differences between channels are known.
+        covariance: of the deviations, (H, H).  The delay common to all clocks may be uncertain by milliseconds while
+        differences between channels are known.  The mean of the others has the variance of the difference to the mean
+        of all n, times (n / (n - 1))^2; their median is less certain than their mean by half of pi.
         """
-        return np.asarray(np.sqrt(((self.centering @ covariance) * self.centering).sum(axis=1).clip(0.0)))
+        variance = covariance.diagonal().copy()
+        for at in self.groups:
+            among, others = covariance[np.ix_(at, at)], len(at) - 1
+            with_all = among.mean(axis=1)
+            centred = (among.diagonal() - 2 * with_all + with_all.mean()).clip(0.0)
+            if others < 1:
+                variance[at] = 0.0
+                continue
+            less_certain = np.pi / 2 - 1 if others > 2 else 0.0  # two have a median that is their mean
+            variance[at] = centred * (len(at) / others) ** 2 + less_certain * centred.mean() / others
+        return variance
+
+    def relative_std(self, covariance: FloatArray) -> FloatArray:
+        """Standard deviations (H,) of the same."""
+        return np.asarray(np.sqrt(self.relative_variance(covariance)))
+
+    @cached_property
+    def prior_along(self) -> FloatArray:
+        """Prior variance of a jump along each direction, (V,)."""
+        return np.asarray(
+            ((self.directions @ self.prior) * self.directions).sum(axis=1) / self.directions.sum(axis=1) ** 2
+        )
 
     @cached_property
     def groups(self) -> tuple[IntArray, ...]:
@@ -69,12 +92,9 @@ class DeviationModel:
         return tuple(at for at in found if len(at))
 
     @cached_property
-    def centering(self) -> FloatArray:
-        """Matrix that subtracts the mean of their group from deviations, (H, H)."""
-        centering = np.eye(self.size)
-        for at in self.groups:
-            centering[np.ix_(at, at)] -= 1 / len(at)
-        return centering
+    def relative_walk(self) -> FloatArray:
+        """Variance per second (H,) of gains and delays less the median of the others of their group."""
+        return self.relative_variance(self.walk)
 
     @cached_property
     def cargo_at(self) -> IntArray:

@@ -18,7 +18,7 @@ from sprung.model.tracking.deviation_model import DeviationModel
 from sprung.model.tracking.filter import Belief
 
 MEMORY = 0.3  # weight of the newest window in the mean sensitivities
-REFERENCE_TIME = 600.0  # s of used windows during which the reference of the baseline is still refined
+LATELY = 100  # windows that are searched for a drift, which the reference of a baseline may have followed until then
 LINEARISATION_ERROR = 0.5  # of the square of a gain: error of a window that was linearised without correcting the gain
 CORRECTED_GAIN = 0.06  # gain from which windows are corrected before they are linearised
 STOPPED = 5.0  # s without a used window after which passengers may have boarded
@@ -31,10 +31,16 @@ class DeviationRecord:
     cross: FloatArray  # mean sensitivity of the log-ratios to the deviations, shape (P, H)
     base_cross: FloatArray  # the same over the windows of the baseline, shape (P, H)
     reference: FloatArray  # deviations while the baseline was learned, shape (H,)
+    reference_variance: FloatArray  # of these, relative to the others of their group, shape (H,)
+    following: FloatArray  # share of a correction of the belief that belongs to the reference, too, shape (H,)
+    followed: FloatArray  # the belief that the reference has followed last, shape (H,)
+    lately: FloatArray  # how far the reference has followed over the last LATELY windows, shape (H,)
     moved: FloatArray  # 1 where a deviation has jumped, or drifted away, since, shape (H,)
     origin: FloatArray  # gains and delays when they were first known, shape (H,); NaN: not yet
     slope: FloatArray  # recent evidence for a jump along each direction, shape (V,)
     curvature: FloatArray  # its information, shape (V,)
+    trend: FloatArray  # evidence of the last windows, however weak, that a direction is followed late, shape (V,)
+    trend_curvature: FloatArray  # its information, shape (V,)
     since: IntArray  # ns, when the evidence began to rise, shape (V,)
     excess: FloatArray  # part of chi-square that known deviations explain, mean over windows, shape (1,)
     recent: IntArray  # ns, the last windows with sensitivities of their own, shape (3,); 0: none
@@ -44,22 +50,44 @@ class DeviationRecord:
         """Log-likelihood ratio of a jump along each direction, shape (V,)."""
         return np.asarray(self.slope**2 / (2 * np.maximum(self.curvature, 1e-12)))
 
+    def lag(self, model: DeviationModel) -> FloatArray:
+        """How far the last windows lie beyond what is believed, along each direction, shape (V,)."""
+        return np.asarray(self.trend / (self.trend_curvature + 1 / model.prior_along))
+
 
 def start(parameters: int, model: DeviationModel) -> DeviationRecord:
     H, V = model.size, len(model.directions)
     zeros = np.zeros
     return DeviationRecord(
-        zeros((parameters, H)), zeros((parameters, H)), zeros(H), zeros(H), np.full(H, np.nan), zeros(V), zeros(V),
-        zeros(V, dtype=np.int64), zeros(1), zeros(3, dtype=np.int64),
-    )  # fmt: skip
+        cross=zeros((parameters, H)),
+        base_cross=zeros((parameters, H)),
+        reference=zeros(H),
+        reference_variance=model.relative_variance(model.prior),
+        following=np.ones(H),
+        followed=zeros(H),
+        lately=zeros(H),
+        moved=zeros(H),
+        origin=np.full(H, np.nan),
+        slope=zeros(V),
+        curvature=zeros(V),
+        trend=zeros(V),
+        trend_curvature=zeros(V),
+        since=zeros(V, dtype=np.int64),
+        excess=zeros(1),
+        recent=zeros(3, dtype=np.int64),
+    )
 
 
 def extended(record: DeviationRecord, belief: Belief, model: DeviationModel) -> tuple[DeviationRecord, Belief]:
     """An older state, extended by the model's deviations and directions that it does not have yet."""
     old, H, V = belief.deviations, model.size, len(model.directions)
     zeros = np.zeros(V)
+    if np.isnan(record.following).any():
+        record = _of_fixed_reference(record, model, belief)
     if len(record.slope) != V:
-        record = replace(record, slope=zeros, curvature=zeros, since=zeros.astype(np.int64))
+        record = replace(
+            record, slope=zeros, curvature=zeros, trend=zeros, trend_curvature=zeros, since=zeros.astype(np.int64)
+        )
     if old >= H:
         return record, belief
     more, first = H - old, len(belief.mean)
@@ -67,10 +95,24 @@ def extended(record: DeviationRecord, belief: Belief, model: DeviationModel) -> 
     covariance[:first, :first] = belief.covariance
     covariance[first:, first:] = model.prior[old:, old:]
     wider = {name: np.pad(getattr(record, name), ((0, 0), (0, more))) for name in ("cross", "base_cross")}
-    longer = {name: np.pad(getattr(record, name), (0, more)) for name in ("reference", "moved", "origin")}
+    fresh = start(len(record.cross), model)
+    longer = {
+        name: np.append(getattr(record, name), getattr(fresh, name)[old:])
+        for name in ("reference", "reference_variance", "following", "followed", "lately", "moved", "origin")
+    }
     return (
         replace(record, **wider, **longer),
         Belief(np.pad(belief.mean, (0, more)), covariance, H),
+    )
+
+
+def _of_fixed_reference(record: DeviationRecord, model: DeviationModel, belief: Belief) -> DeviationRecord:
+    """An older state's record: its reference was the belief for ten minutes, up to a drift that was not seen."""
+    old = belief.deviations
+    unseen = np.where(np.isfinite(model.drift_limit), model.rules.drifted / 3 * model.drift_limit, 0.0)[:old] ** 2
+    zeros = np.zeros(old)
+    return replace(
+        record, reference_variance=unseen, following=zeros, followed=belief.mean[len(belief.mean) - old :], lately=zeros
     )
 
 
@@ -80,6 +122,7 @@ class Jump:
 
     direction: FloatArray  # shape (H,)
     size: float
+    std: float
     since: int  # ns
     kind: str
 
@@ -92,6 +135,7 @@ def update(
     share: of the window that no earlier window with sensitivities contains.
     """
     H = model.size
+    calibration, belief = _drift_opened(calibration, model, belief)
     here = belief.mean[-H:]
     P = belief.covariance[-H:, -H:]
     M = found.information * share
@@ -130,32 +174,85 @@ def update(
     )
 
 
+def faded(record: DeviationRecord, model: DeviationModel, belief: Belief, added: FloatArray) -> DeviationRecord:
+    """The record when the believed deviations become less certain by the relative variances `added` (H,).
+
+    Smoothing at a fixed point: of a correction of a random walk now, the share cov(then, now) / var(now) belongs to its
+    value at an earlier time, too.  It is multiplied by var / (var + added) whenever the value may have changed.
+    """
+    variance = model.relative_variance(belief.covariance[-model.size :, -model.size :])
+    share = variance / np.maximum(variance + added, 1e-300)
+    return replace(record, following=record.following * np.where(added > 0, share, 1.0))
+
+
 def update_reference(
-    record: DeviationRecord, model: DeviationModel, belief: Belief, here: BoolArray
+    record: DeviationRecord,
+    model: DeviationModel,
+    belief: Belief,
+    before: FloatArray,
+    *,
+    armed: bool,
+    settled: bool,
 ) -> DeviationRecord:
     """Refines the deviations under which the baseline was learned (`reference`).
 
-    The current belief replaces the reference, except for deviations that have drifted since: these keep the value at
-    which they were first known.  here: deviations (H,) whose current value may become the first known one.
+    before: relative variances (H,) of the deviations before the window.  The reference takes its share of the belief's
+    corrections, which `faded` lessens.  Until the baseline is known (`armed`), deviations are found but do not jump.
+    Afterwards it rests while a jump may still be shared out among channels (not `settled`), and one that is moved far
+    from the value that was known first has followed a drift, and returns to it.
     """
-    value, moved = belief.mean[-model.size :], record.moved > 0
-    known, origin = np.isfinite(record.origin), record.origin
-    if not (known | moved | ~here).all():
-        std = model.relative_std(belief.covariance[-model.size :, -model.size :])
-        origin = np.where(here & ~known & ~moved & (std < model.rules.known * model.drift_limit), value, origin)
-        known = np.isfinite(origin)
-    off = np.where(known, value - origin, 0.0)
-    away = np.abs(off - model.common_value(off, known & ~moved))
-    shifted = known & ~moved & (away > model.rules.drifted * model.drift_limit)
-    # A value common to all channels is not identifiable: when it wanders, references of moved deviations follow it.
-    kept = np.where(shifted, origin, record.reference)
-    kept = kept + model.common_value(value - record.reference, ~(moved | shifted))
+    value, free = belief.mean[-model.size :], model.refined
+    variance = model.relative_variance(belief.covariance[-model.size :, -model.size :])
+    if armed and not settled:
+        return record
+    moved, limit = record.moved > 0, model.drift_limit
+    by = value - record.followed
+    # A value common to all channels is not identifiable: when it wanders, all references follow it.
+    common = model.common_value(by, ~moved)
+    opened = before / np.maximum(variance, before) if armed else 1.0  # where the filter has lost a parameter
+    share = np.where(moved, 0.0, record.following * opened)
+    step = share * (by - common)
+    reference = np.where(free, value, record.reference + step + common)
+    lately = np.where(moved, record.lately, record.lately * (1 - 1 / LATELY) + step)
+    smoothed = record.reference_variance - share**2 * (before - variance)
+    std = np.sqrt(variance)
+    known, here = np.isfinite(record.origin), armed & ~model.cargo & (std < model.rules.known * limit)
+    origin = np.where(known, record.origin + common, np.where(here & ~moved, value, np.nan))
+    off = np.where(known, reference - origin, 0.0)
+    dragged = (
+        known & ~moved & ~free & (np.abs(off - model.common_value(off, known & ~moved)) > model.rules.drifted * limit)
+    )
+    away = value - reference
+    left = (
+        armed
+        & ~moved
+        & ~free
+        & (std < model.rules.known * limit)
+        & (np.abs(away - model.common_value(away, ~moved)) > limit)
+    )
+    first = np.where(dragged, (model.rules.known * limit) ** 2, smoothed)
     return replace(
         record,
+        reference=np.where(dragged, origin, reference),
+        reference_variance=np.where(moved, record.reference_variance, np.maximum(first, share**2 * variance)),
+        following=share,
+        followed=value,
+        lately=np.where(dragged, 0.0, lately),
+        moved=np.maximum(record.moved, dragged | left),
         origin=origin,
-        moved=np.maximum(record.moved, shifted),
-        reference=np.where(moved | shifted, kept, value),
     )
+
+
+def change_variance(record: DeviationRecord, model: DeviationModel, belief: Belief) -> FloatArray:
+    """Variances (H,) of the differences between the believed deviations and the reference of the baseline.
+
+    Both less what is common to their group.  The reference is as uncertain as what determined it, and may have followed
+    a drift that was not seen yet.
+    """
+    now = model.relative_variance(belief.covariance[-model.size :, -model.size :])
+    shared = np.where(record.moved > 0, 0.0, record.following) * now
+    apart = now + record.reference_variance - 2 * shared
+    return np.asarray(apart.clip(0.0) + record.lately**2)
 
 
 def drifted(record: DeviationRecord, model: DeviationModel, belief: Belief) -> tuple[FloatArray, BoolArray]:
@@ -170,7 +267,7 @@ def drifted(record: DeviationRecord, model: DeviationModel, belief: Belief) -> t
 
 
 def pending_variance(record: DeviationRecord, model: DeviationModel) -> FloatArray:
-    """Variance (H,) of gains and delays for a suspected jump in the most significant direction.
+    """Variance (H,) of gains and delays for a suspected jump, or a drift, in the most significant direction.
 
     The belief tracks the slow drift of electronics; faster changes it tracks late, until a jump is found.
     """
@@ -179,7 +276,33 @@ def pending_variance(record: DeviationRecord, model: DeviationModel) -> FloatArr
         return np.zeros(model.size)
     best = int(np.argmax(ratio))
     size = record.slope[best] / record.curvature[best]
-    return np.asarray((model.directions[best] != 0) * expit(ratio[best] - model.rules.doubt) * size**2)
+    jumped = (model.directions[best] != 0) * expit(ratio[best] - model.rules.doubt) * size**2
+    return np.asarray(np.maximum(jumped, _lag_variance(record, model)))
+
+
+def _lag_variance(record: DeviationRecord, model: DeviationModel) -> FloatArray:
+    """Variance (H,) of gains and delays that drift faster than they are followed, as far as windows show that."""
+    lag = record.lag(model)
+    doubtful = np.where(model.channel_directions, expit(0.5 * record.trend * lag - model.rules.drifting) * lag**2, 0.0)
+    return np.asarray((np.abs(model.directions) * doubtful[:, None]).max(axis=0, initial=0.0))
+
+
+def _drift_opened(record: DeviationRecord, model: DeviationModel, belief: Belief) -> tuple[DeviationRecord, Belief]:
+    """Record and belief before a window, where the last windows lie to one side of what is believed.
+
+    What then drifts does so faster than its random walk: it is followed late, and would be stated as too certain.  Its
+    variance, and that of the parameters that take up the rest, grows by the square of the lag in LATELY windows.
+    """
+    size = record.lag(model)
+    ratio = np.where(model.channel_directions, 0.5 * record.trend * size, 0.0)
+    best = int(np.argmax(ratio)) if len(ratio) else -1
+    if best < 0 or ratio[best] < model.rules.drifting:
+        return record, belief
+    lag = model.directions[best] * (size[best] / np.sqrt(LATELY))
+    along = np.zeros(len(belief.mean))
+    along[-model.size :], along[: belief.size] = lag, record.cross @ lag
+    opened = replace(belief, covariance=belief.covariance + np.outer(along, along))
+    return faded(record, model, belief, lag**2), opened
 
 
 def linearisation_std(gain: FloatArray) -> FloatArray:
@@ -235,6 +358,8 @@ def _test_jumps(
     keep = np.where(lasting & (old * (rules.forgetting * old + along * bounded) > 0), rules.forgetting, 0.0)
     slope = keep * old + along * bounded
     curvature = keep * calibration.curvature + information
+    trend = (1 - 1 / LATELY) * calibration.trend + along * bounded
+    trend_curvature = (1 - 1 / LATELY) * calibration.trend_curvature + information
     ratio = slope**2 / (2 * curvature)
     since = np.where((ratio >= rules.onset) & (calibration.ratio < rules.onset), time, calibration.since)
     best = int(np.argmax(ratio)) if len(ratio) else -1
@@ -242,10 +367,15 @@ def _test_jumps(
     if best >= 0 and ratio[best] >= rules.evidence:
         direction = model.directions[best]
         kind = model.kinds[int(np.argmax(direction))]
-        size = slope[best] / curvature[best] if bounded == 1.0 else along[best] / information[best]
-        jump = Jump(direction, float(size), int(since[best]), kind)
-        slope, curvature = np.zeros_like(slope), np.zeros_like(curvature)
-    return replace(calibration, slope=slope, curvature=curvature, since=since), jump
+        told, by = (slope[best], curvature[best]) if bounded == 1.0 else (along[best], information[best])
+        jump = Jump(direction, float(told / by), float(by**-0.5), int(since[best]), kind)
+        slope = curvature = trend = trend_curvature = np.zeros_like(slope)
+    return (
+        replace(
+            calibration, slope=slope, curvature=curvature, trend=trend, trend_curvature=trend_curvature, since=since
+        ),
+        jump,
+    )
 
 
 def _reopen_jumped(belief: Belief, model: DeviationModel, cross: FloatArray, jump: Jump) -> Belief:

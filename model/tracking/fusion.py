@@ -84,8 +84,9 @@ class Fusion:
             return replace(state, last=time_ns, rejected=state.rejected + 1, belief=belief), None
         belief, cargo = self._with_loads(state, belief, elapsed, conditions)
         share, weight = min(1.0, elapsed / self.settings.window), noise_weight(estimate.noise)
+        calibration = self._faded(state, elapsed)
         belief, calibration, found, jump, agrees = self._with_deviations(
-            state.calibration, belief, found, time_ns, (share, weight)
+            calibration, belief, found, time_ns, (share, weight)
         )
         if estimate.faults and not agrees:  # the window was corrected by a fault that the belief does not support yet
             undecided = replace(state, last=time_ns, rejected=state.rejected + 1)
@@ -98,8 +99,9 @@ class Fusion:
         window = TrackedWindow(mask, time_ns, centre, share, weight, *values, own_cross)
         window = in_linear_scale(window, belief)
         filtered = self._filtered(state, belief, calibration, window)
-        weather, tested = self._tested(state, calibration, conditions, window, filtered)
         settled = jump is None and _is_settled(state, calibration, self.model, centre)
+        calibration = self._followed(state, calibration, filtered.belief, settled=settled)
+        weather, tested = self._tested(state, calibration, conditions, window, filtered)
         new = replace(
             state,
             last=time_ns,
@@ -109,9 +111,7 @@ class Fusion:
             inflation=filtered.inflation,
             innovation=filtered.innovation,
             changes=tested,
-            calibration=self.effects.learned(
-                state, tested, calibration, window.cross, filtered.belief, armed=self.armed(state), settled=settled
-            ),
+            calibration=self.effects.learned(state, tested, calibration, window.cross),
             weather=weather,
             cargo=cargo,
         )
@@ -124,6 +124,22 @@ class Fusion:
         elapsed, settings = (time_ns - state.last) * 1e-9, self.settings
         predicted = kalman.predict(state.belief, elapsed, settings.process, settings.prior, self.model.walk, self.limit)
         return predicted, elapsed
+
+    def _faded(self, state: TrackerState, elapsed: float) -> dev.DeviationRecord:
+        """Record of the deviations `elapsed` seconds after the last window."""
+        if not self.model.size or state.last is None:
+            return state.calibration
+        return dev.faded(state.calibration, self.model, state.belief, self.model.relative_walk * elapsed)
+
+    def _followed(
+        self, state: TrackerState, calibration: dev.DeviationRecord, belief: kalman.Belief, *, settled: bool
+    ) -> dev.DeviationRecord:
+        """Record whose reference has followed the belief after a window."""
+        H = self.model.size
+        if not H:
+            return calibration
+        before = self.model.relative_variance(state.belief.covariance[-H:, -H:])
+        return dev.update_reference(calibration, self.model, belief, before, armed=self.armed(state), settled=settled)
 
     def _with_deviations(
         self,
@@ -196,7 +212,7 @@ class Fusion:
     ) -> tuple[weathers.Weather, change_test.Changes]:
         """Weather and change tests after a window, corrected for the effects of deviations and weather."""
         settings, belief, variance, mask = self.settings, filtered.belief, filtered.variance, window.mask
-        shift = self.effects.baseline_shift(state, calibration, window.cross, belief)
+        shift = self.effects.baseline_shift(state, calibration, window.cross)
         assert state.weather is not None
         at = weathers.features(state.weather, conditions, self.load(belief))
         usable = mask & (state.changes.learned >= settings.learning)

@@ -65,6 +65,9 @@ class JumpRules:
         6.0, "log-likelihood ratio from which alarms wait; derived: by chance in one window of ten", 4.0, 9.0
     )
     doubt: float = rule(6.0, "log-likelihood ratio at which half of a jump is uncertainty; chosen: as above", 4.0, 9.0)
+    drifting: float = rule(
+        3.0, "log-likelihood ratio from which a channel is followed faster; derived: by chance in one of 70", 2.0, 4.5
+    )
     onset: float = rule(3.0, "log-likelihood ratio that dates a jump; chosen: above chance", 2.0, 5.0)
     gain: float = rule(0.01, "jump of a gain without an alarm; chosen: electronics", 0.005, 0.02)
     delay: float = rule(3e-4, "s, jump of a delay without an alarm; chosen: a third of a sample at 1 kHz", 1e-4, 6e-4)

@@ -213,6 +213,10 @@ def _calibration(data: Mapping[str, Any]) -> DeviationRecord:
         return deviations.start(len(data["names"]), model_of(()))
     arrays = _unpack_all(data["calibration"])
     arrays.setdefault("origin", np.full(len(arrays["reference"]), np.nan))
+    unknown = np.full(len(arrays["reference"]), np.nan)  # `deviations.extended` knows what older states leave open
+    arrays = {"reference_variance": unknown, "following": unknown, "followed": unknown, "lately": unknown} | arrays
+    none = np.zeros(len(arrays["slope"]))
+    arrays = {"trend": none, "trend_curvature": none} | arrays
     shape = len(data["names"]), len(arrays["reference"])
     return DeviationRecord(**arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
 

@@ -54,14 +54,17 @@ def test_a_channel_is_known_among_others_although_their_common_clock_is_open() -
     assert abs(fault.value - 1e-3) < 4 * fault.std + 2.6e-4  # a quarter of it is in the mean of four
 
 
-def test_relative_deviations_are_those_of_the_closed_form() -> None:
-    rng, model = np.random.default_rng(2), model_of(LOADED)
-    factor = rng.normal(size=(6, 6))
-    covariance = factor @ factor.T
-    draws = rng.multivariate_normal(np.zeros(6), covariance, 40_000)
-    apart = draws.copy()
-    apart[:, :4] -= draws[:, :4].mean(axis=1, keepdims=True)
-    np.testing.assert_allclose(model.relative_std(covariance), apart.std(axis=0), rtol=0.03)
+@pytest.mark.parametrize("size", [2, 3, 4, 9, 28])
+def test_relative_deviations_are_those_of_the_median_of_the_others(size: int) -> None:
+    """What is stated of a channel is its difference to the median of the others, whatever is common to all."""
+    rng = np.random.default_rng(2)
+    model = model_of([*[Deviation(f"c{i}", "delay", 5e-3, 0) for i in range(size)], *LOADED[-2:]])
+    own = np.append(rng.uniform(0.9, 1.1, size) * np.append(3.0, np.ones(size - 1)), [2.0, 0.5])
+    covariance = np.diag(own**2) + 25 * np.pad(np.ones((size, size)), (0, 2))
+    draws = rng.multivariate_normal(np.zeros(size + 2), covariance, 40_000)
+    (stated, truth) = model.relative_std(covariance), np.array([draws[:, i].std() for i in range(size + 2)])
+    truth[0] = (draws[:, 0] - np.median(draws[:, 1:size], axis=1)).std()
+    np.testing.assert_allclose(stated[[0, -2, -1]], truth[[0, -2, -1]], rtol=0.04)
 
 
 def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor() -> None:
@@ -295,3 +298,55 @@ def test_identification_is_told_all_gains_or_none_and_all_delays_or_none() -> No
     assert [f.kind for f in tracker.known_faults(stuck)] == ["frozen", *["gain"] * 4]
     exchanged = replace(state, stuck=(Stuck("c0|c1", "swapped", 0.0, 6, EPOCH),))
     assert [f.kind for f in tracker.known_faults(exchanged)] == ["swapped"]
+
+
+def _stated(
+    rng: np.random.Generator, begins: int, to: float, over: int, channels: int = 6
+) -> tuple[list[float], list[float]]:
+    """Errors over stated deviations, every ten windows, of the alarms and of the reports of one drifting gain.
+
+    The gain of one channel drifts to 1 + `to` within `over` windows after `begins` windows.  What alarms state is the
+    change since the baseline, what is reported the value now, both relative to the median of the other channels.
+    """
+    tracker = make([Deviation(f"c{i}", "gain", 0.015, i) for i in range(channels)])
+    state, apart = tracker.initial_state(), np.eye(channels) - 1 / channels
+    cross = np.zeros((6, channels))
+    cross[0, 0] = 1.0
+    changes, values = [], []
+    for k in range(begins + over + 200):
+        gains = np.zeros(channels)
+        gains[0] = to * np.clip((k + 1 - begins) / max(over, 1), 0, 1)
+        M, covariance = apart / 0.01**2, correlated(rng, STD)
+        score = M @ gains + apart @ rng.normal(size=channels) / 0.01
+        value = np.linalg.cholesky(covariance) @ rng.normal(size=6) - cross @ gains
+        found = Deviating(np.zeros(channels), covariance, cross, M, score, 300.0, True)
+        state = tracker.update(state, estimate(value, covariance, deviating=found), EPOCH + k * SECOND)
+        if k % 10 == 0:
+            changes += [(a.change - gains[0]) / a.std for a in state.active if a.change is not None and a.std]
+            values += [(f.value - 1 - gains[int(f.channel[1:])]) / f.std for f in tracker.sensors(state)]
+    assert [(a.kind, a.parameter, a.closed) for a in state.alarms] == [("sensor", "c0.gain", None)]
+    return changes, values
+
+
+@pytest.mark.parametrize(
+    ("begins", "to", "over", "channels"),
+    [
+        pytest.param(400, 0.06, 400, 6, marks=pytest.mark.slow),
+        (60, 0.06, 400, 6),  # while the gains of the baseline are being determined
+        (60, 0.05, 0, 6),
+        pytest.param(400, 0.05, 0, 3, marks=pytest.mark.slow),
+        pytest.param(900, 0.06, 400, 6, marks=pytest.mark.slow),
+        pytest.param(900, -0.06, 1500, 6, marks=pytest.mark.slow),
+        pytest.param(60, 0.06, 1500, 6, marks=pytest.mark.slow),
+        pytest.param(900, 0.05, 0, 16, marks=pytest.mark.slow),
+        pytest.param(900, 0.06, 400, 16, marks=pytest.mark.slow),
+    ],
+)
+def test_what_is_stated_of_a_gain_is_as_wrong_as_it_says(begins: int, to: float, over: int, channels: int) -> None:
+    """A gain that drifts faster than electronics age is followed late, and its baseline may have followed it."""
+    both = [_stated(np.random.default_rng(seed), begins, to, over, channels) for seed in (41, 42)]
+    for errors in (np.concatenate([one[part] for one in both]) for part in (0, 1)):
+        assert len(errors) > 20
+        assert np.mean(np.abs(errors) < 3) > 0.95
+        assert 0.3 < np.sqrt(np.mean(errors**2)) < 1.6
+        assert np.abs(errors[-5:]).max() < 3
