@@ -70,11 +70,11 @@ class System:
     catalogue: tuple[Law, ...] = CATALOGUE
     whole: bool = False  # whether laws of bodies and of the structure are part of the mechanics; see `whole_system`
     as_drawn: bool = False  # whether bodies are as the file says, see `built`
+    lost: frozenset[str] = frozenset()  # channels of inputs that are not measured for the time being
 
     def __reduce__(self) -> tuple[Callable[..., System], tuple[object, ...]]:
         """To another process goes the file: the bundled laws are there already, and functions do not travel."""
-        own = () if self.catalogue is CATALOGUE else (self.catalogue,)
-        return (_whole_again if self.whole else System), (self.file, *own)
+        return _again, (self.file, None if self.catalogue is CATALOGUE else self.catalogue, self.whole, self.lost)
 
     @cached_property
     def laws(self) -> tuple[PlacedLaw, ...]:
@@ -350,8 +350,8 @@ class System:
         return structure_of(self.file)
 
 
-def _whole_again(file: SystemFile, catalogue: tuple[Law, ...] = CATALOGUE) -> System:
-    return System(file, catalogue, whole=True)
+def _again(file: SystemFile, catalogue: tuple[Law, ...] | None, whole: bool, lost: frozenset[str]) -> System:
+    return System(file, CATALOGUE if catalogue is None else catalogue, whole=whole, lost=lost)
 
 
 def load_system(path: str | Path = MANCHESTER, catalogue: tuple[Law, ...] = CATALOGUE) -> System:

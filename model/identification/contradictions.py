@@ -86,10 +86,10 @@ class Contradictions:
     def contradicted(self, windows: FloatArray) -> BoolArray:
         """Whether channels contradict each other in windows (B, T, C), shape (B,)."""
         found = np.zeros(len(windows), dtype=bool)
-        present = self._present(windows)
-        for alike in np.unique(present, axis=0):
-            at = np.flatnonzero((present == alike).all(axis=1))
-            found[at] = self._relations(windows[at], alike).violated.any(axis=1)
+        there = np.asarray(~np.isnan(windows).any(axis=1))
+        for alike in np.unique(there, axis=0):
+            at = np.flatnonzero((there == alike).all(axis=1))
+            found[at] = self._relations(windows[at], alike[self.inputs :]).violated.any(axis=1)
         return found
 
     def ended_by(self, window: FloatArray) -> tuple[Rearrangement, ...]:
@@ -115,10 +115,14 @@ class Contradictions:
         return np.asarray(~np.isnan(windows[:, :, self.inputs :]).any(axis=1))
 
     def _relations(self, windows: FloatArray, present: BoolArray) -> _Relations:
-        """Of sensors that are `present`, (S,), and of inputs of one support."""
+        """Of sensors that are `present`, (S,), and of inputs of one support none of which is lost in any window."""
         redundancy, first = self.calibration.redundancy, self.inputs
         sensors = first + np.flatnonzero(present)
         of_sensors, of_inputs = self.calibration.dropped(present).numpy(), redundancy.relations(first)
+        lost = np.isnan(windows[:, :, :first]).any(axis=(0, 1))
+        if lost.any():
+            of_inputs = of_inputs[~(of_inputs[:, lost] != 0).any(axis=1)]
+            windows = np.concatenate([np.where(lost, 0.0, windows[:, :, :first]), windows[:, :, first:]], axis=2)
         rows = np.zeros((len(of_sensors) + len(of_inputs), windows.shape[2]))
         gram = np.zeros((len(windows), windows.shape[2], windows.shape[2]))
         freedom = np.zeros(len(rows))

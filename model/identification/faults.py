@@ -72,8 +72,14 @@ class Explainer:
         samples: int,
         refiner: Callable[[int], Refines],
         start: Callable[[FloatArray], FloatArray] | None,
+        without: Callable[[int, frozenset[str]], Refines] | None = None,
     ) -> None:
-        """refiner: of windows of so many samples; start: from windows (B, T, C) to log-ratios to refine from."""
+        """refiner: of windows of so many samples; start: from windows (B, T, C) to log-ratios to refine from.
+
+        without: refiner of windows of so many samples in which channels of inputs are lost; None: a system, as one with
+        laws, whose inputs are all needed.
+        """
+        self._lossy = without
         self.system, self.samples, self.start, self.refiner = system, samples, start, refiner
         deviations = refiner(samples).calibration.deviations
         self.deviations = deviations
@@ -131,7 +137,7 @@ class Explainer:
             return {}
         causes = [(*turned, *seen[b]) for b in rows.tolist()]
         columns = np.array([self.names.index(name) for name in stuck], dtype=np.int64)
-        if (columns < len(self.system.inputs)).any():
+        if not self._can_lose(columns):
             return dict(zip(rows.tolist(), self._or_as_they_are(windows[rows], causes, {}), strict=True))
         restored = windows[rows]
         for rearrangement in undone:
@@ -140,6 +146,13 @@ class Explainer:
         agree = np.flatnonzero(~self.contradictions.contradicted(restored))
         explained = self._by_steps(restored[agree], [causes[i] for i in agree])
         return {int(rows[agree[i]]): e for i, e in explained.items()}
+
+    def _can_lose(self, columns: IntArray) -> bool:
+        """Whether windows can be refined without these channels: some input must be left, unless sensors alone are
+        lost."""
+        inputs = len(self.system.inputs)
+        lost = int(np.count_nonzero(np.unique(columns) < inputs))
+        return lost == 0 or (self._lossy is not None and lost < inputs)
 
     def contradictory(self, windows: FloatArray, bad: IntArray) -> dict[int, FaultExplanation]:
         """Explanations, by index, of those of the windows `bad` of a batch (B, T, C) whose redundant channels
@@ -285,27 +298,33 @@ class Explainer:
 
     def _refined(self, windows: FloatArray, point: FloatArray, loads: BoolArray) -> list[Refined]:
         """Corrected windows refined, with their evidence; one `Refined` of one window each."""
-        margin = self.margin(point)
+        margin, first = self.margin(point), len(self.system.inputs)
+        lost: BoolArray = np.asarray(np.isnan(windows[:, :, :first]).any(axis=1))
+        alike = np.unique(np.column_stack([margin, loads, lost]).astype(np.int64), axis=0, return_inverse=True)[1]
         out: list[Refined | None] = [None] * len(windows)
-        for edge in np.unique(margin):
-            for with_loads in (False, True):
-                rows = np.flatnonzero((margin == edge) & (loads == with_loads))
-                if len(rows) == 0:
-                    continue
-                restored = self.corrected(windows[rows], point[rows])
-                start = None if self.start is None else self.start(restored)
-                inner = restored[:, edge : self.samples - edge]
-                refined = self.refiner(inner.shape[1]).refine(
-                    inner,
-                    start,
-                    loads=with_loads,
-                    built=with_loads,
-                    weigh=np.ones(len(rows), dtype=bool),
-                    iterations=ITERATIONS,
-                )
-                for k, row in enumerate(rows):
-                    out[row] = refined.take(np.array([k]))
+        for group in np.unique(alike):
+            rows = np.flatnonzero(alike == group)
+            edge, with_loads = int(margin[rows[0]]), bool(loads[rows[0]])
+            restored = self.corrected(windows[rows], point[rows])
+            start = None if self.start is None or lost[rows[0]].any() else self.start(restored)
+            inner = restored[:, edge : self.samples - edge]
+            refined = self._refiner_of(inner.shape[1], lost[rows[0]]).refine(
+                np.where(np.append(lost[rows[0]], np.zeros(inner.shape[2] - first, dtype=bool)), 0.0, inner),
+                start,
+                loads=with_loads,
+                built=with_loads,
+                weigh=np.ones(len(rows), dtype=bool),
+                iterations=ITERATIONS,
+            )
+            for k, row in enumerate(rows):
+                out[row] = refined.take(np.array([k]))
         return [one for one in out if one is not None]
+
+    def _refiner_of(self, samples: int, lost: BoolArray) -> Refines:
+        """Refiner of windows of so many samples without the inputs that are `lost`, (I,)."""
+        if self._lossy is None or not lost.any():
+            return self.refiner(samples)
+        return self._lossy(samples, frozenset(self.names[c] for c in np.flatnonzero(lost)))
 
     def points(self, known: Sequence[tuple[MeasurementFault, ...]], windows: int) -> FloatArray:
         """The gains and delays among what is known of each of some windows as deviations, (B, H)."""
@@ -420,12 +439,11 @@ class Explainer:
         return named(self.deviations, point, np.zeros(len(point)), np.abs(point) > 0)
 
     def _without(self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]]) -> list[FaultExplanation]:
-        """Windows (B, T, C) without the sensors that the faults of each name; a stuck input is named, though not
-        corrected."""
+        """Windows (B, T, C) without the channels that the faults of each name."""
         without, sensible = windows.copy(), []
         for b, its in enumerate(faults):
             columns = [self.names.index(name) for fault in its for name in fault.channel.split("|")]
-            if min(columns) >= len(self.system.inputs):
+            if self._can_lose(np.array(columns)):
                 without[b][:, columns] = np.nan
                 sensible.append(b)
         explained = self._by_steps(without[sensible], [faults[b] for b in sensible])

@@ -28,6 +28,7 @@ from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
 from sprung.model.work import WorkBudget
 
+KEPT = 8  # refiners of windows without some inputs
 MANY = 24  # windows of a batch without start values, from which on some are refined first to start the others
 PILOTS = 6  # of these; their median is near, since batches are of one vehicle for the most part
 NOT_EXPLAINED = "whether a measurement is wrong was not looked into to the end: it takes longer than "
@@ -52,6 +53,7 @@ class Identifier:
     seconds: float = math.inf
     times: StageTimes = field(default_factory=StageTimes)
     _refiners: dict[int, Refines] = field(default_factory=dict)
+    _lossy: dict[tuple[int, frozenset[str]], Refines] = field(default_factory=dict)
     _explainers: dict[int, Explainer] = field(default_factory=dict)
     _model_uncertainty: ModelUncertainty | None = None
     _work: WorkBudget = field(default_factory=_no_limit)
@@ -273,7 +275,8 @@ class Identifier:
             fitting = estimator is not None and estimator.samples == samples
             loads = bool(self.system.loads)
             start = (lambda w: estimator.start(w, loads=loads)) if estimator and fitting else None
-            self._explainers[samples] = Explainer(self.system, samples, self._refiner, start)
+            without = None if acting_laws(self.system) else self._refiner_without
+            self._explainers[samples] = Explainer(self.system, samples, self._refiner, start, without)
         return self._explainers[samples]
 
     def _refiner(self, samples: int) -> Refines:
@@ -283,6 +286,15 @@ class Identifier:
             else:
                 self._refiners[samples] = Refiner(self.system.whole_system, samples, self.workers)
         return self._refiners[samples]
+
+    def _refiner_without(self, samples: int, lost: frozenset[str]) -> Refines:
+        """That of windows in which these channels of inputs are not measured."""
+        key = samples, lost
+        if key not in self._lossy:
+            if len(self._lossy) >= KEPT:
+                del self._lossy[next(iter(self._lossy))]
+            self._lossy[key] = Refiner(replace(self.system.whole_system, lost=lost), samples, self.workers)
+        return self._lossy[key]
 
     def _checked(self, windows: FloatArray) -> FloatArray:
         windows = np.asarray(windows, dtype=np.float64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from sprung.model.identification.gauss_newton import Chord, Linearisation, Trans
 from sprung.model.mechanics import DEFLECTION, FORCE
 from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import BoolArray, FloatArray
+from sprung.model.simulate.drives import drives_of
 from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator
 from sprung.model.simulate.loading import by_inertia, load_terms
 from sprung.model.system import System
@@ -23,6 +24,26 @@ BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any informative window
 _RIDGE = 1e-11  # relative, on the normalised free responses
 _UNSEEN = 1e-13  # of the largest free response: below is rounding; those that are seen differ by 1e-4, units included
+
+
+@dataclass(frozen=True, slots=True)
+class _Residual:
+    """What windows leave at given parameters, with what it takes to say so; whitened, B windows."""
+
+    values: ElementValues
+    discrete: Discrete  # of the compressed signals
+    forced: Tensor  # states without free responses, (B, T, N)
+    transfer: Transfer
+    carried: Tensor  # what the noise of the drives brings to the signals, (B, F, R, W/2)
+    whiten: Tensor  # (B, F, R, R)
+    r: Tensor  # residual before the initial state is chosen, (B, 1, K)
+    basis: Tensor  # free responses, normalised, (B, N', K)
+    free_scale: Tensor  # what they were divided by, (B, N')
+    factor: Tensor  # Cholesky factor of their products, (B, N', N')
+    along: Tensor  # products of free responses and residual, (B, N', 1)
+    x0: Tensor  # best initial state, (B, N)
+    cost: Tensor  # weighted squares with it, (B,)
+    left: Tensor  # residual with it, (B, F, R, 1)
 
 
 class WindowModel:
@@ -39,7 +60,22 @@ class WindowModel:
         self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
         self.input_noise = np.array([channel.noise or USUAL_NOISE[channel.unit] for channel in system.inputs])
         self.compression = Compression(system, samples)
+        lost = np.array([drive.lost for drive in drives_of(system)], dtype=bool)
+        self.lost = int(lost.sum())  # drives that are not measured at all
+        self.instrument_noise = self.drive_noise * torch.as_tensor(~lost)  # without what is not measured at all
+        self.blind = self._blind(lost)
         self.precision = torch.as_tensor(prior_std(system) ** -2)
+
+    def _blind(self, lost: BoolArray) -> Tensor:
+        """Parameters (P,) of elements that stand on supports whose drives are `lost` (W/2,): they are not identifiable.
+
+        Whatever spring and damper there are, some motion below gives the force that the vehicle shows.
+        """
+        s = self.simulator
+        on_lost = torch.zeros(len(s.G), dtype=torch.bool)
+        if lost.any() and len(s.supports):
+            on_lost = (s.G[:, torch.as_tensor(lost)[s.supports // 2]] != 0).any(dim=1)
+        return on_lost[s.element_of]
 
     @property
     def states_count(self) -> int:
@@ -56,8 +92,9 @@ class WindowModel:
         return WindowBatch(torch.as_tensor(knots), torch.as_tensor(sensors), present, torch.as_tensor(inputs))
 
     def unknowns(self, present: BoolArray) -> int:
-        """Numbers of a window that are eliminated: its first state, and trends."""
-        return self.states_count + (self.compression.trends(present).shape[2] if self.compression.integrated else 0)
+        """Numbers of a window that are eliminated: its first state, trends, and the spectra of lost inputs."""
+        trends = self.compression.trends(present).shape[2] if self.compression.integrated else 0
+        return self.states_count + trends + 2 * self.bins * self.lost
 
     def _open(self, free: Tensor, data: WindowBatch) -> Tensor:
         """Free responses (B, T, R, N) and what else is unknown of the window, (B, T, R, N')."""
@@ -66,8 +103,27 @@ class WindowModel:
         trends = self.compression.trends(data.present)
         return torch.cat([free, trends.expand(len(free), *trends.shape)], dim=3) if trends.shape[2] else free
 
-    def linearise(self, x: Tensor, data: WindowBatch) -> Linearisation:
-        """Everything at log-ratios x (B, P)."""
+    def with_lost(self, x: Tensor, data: WindowBatch) -> WindowBatch:
+        """Windows whose lost inputs move as their sensors say at log-ratios x (B, P).
+
+        What they say is left out of the likelihood (`drive_noise`), but the motion of the vehicle, along which it is
+        linearised, is that with these inputs.
+        """
+        if not self.lost:
+            return data
+        at = self._residual(x, data)
+        noise = self.noise_told(at.whiten, at.carried, at.left) * (self.drive_noise != self.instrument_noise)
+        return replace(data, w=self._with_noise(data.w, noise))
+
+    def _with_noise(self, w: Tensor, noise: Tensor) -> Tensor:
+        """Knots (B, T, W) to which what the spectra (B, F, W/2) say is added."""
+        w = w.clone()
+        w[:, :, 0::2] += self.signals(noise)
+        w[:, :, 1::2] += self.signals(self.frequency.jw[:, None] * noise)
+        return w
+
+    def _residual(self, x: Tensor, data: WindowBatch) -> _Residual:
+        """The residual at log-ratios x (B, P), its weights, and the best initial state."""
         s = self.simulator
         values = s.element_values(x)
         discrete = self.compressed(s.discretise(values), data)
@@ -88,21 +144,39 @@ class WindowModel:
         x0_scaled = torch.cholesky_solve(along, factor).squeeze(2)
         x0 = x0_scaled / free_scale
         cost = r.square().sum(dim=(1, 2)) - (along.squeeze(2) * x0_scaled).sum(dim=1)
-
         left = white_residual - white_free @ x0[:, None, :, None].to(white_free.dtype)
         x0 = x0[:, : discrete.Ad.shape[1]]
-        moved = self.moved_by(values, transfer.compliance, self.noise_told(whiten, carried, left))
-        states = forced + s.free_states(discrete, x0, self.samples)
-        J = as_rows(self._by_unknowns(x.shape[1], values, transfer, whiten, states, data, moved))
-        across_products = basis @ J.mT
-        across = torch.cholesky_solve(across_products, factor)
+        return _Residual(
+            values, discrete, forced, transfer, carried, whiten, r, basis, free_scale, factor, along, x0, cost, left
+        )
+
+    def linearise(self, x: Tensor, data: WindowBatch) -> Linearisation:
+        """Everything at log-ratios x (B, P)."""
+        s, at = self.simulator, self._residual(x, data)
+        moved = self.moved_by(at.values, at.transfer.compliance, self.noise_told(at.whiten, at.carried, at.left))
+        states = at.forced + s.free_states(at.discrete, at.x0, self.samples)
+        J = as_rows(self._by_unknowns(x.shape[1], at.values, at.transfer, at.whiten, states, data, moved))
+        across_products = at.basis @ J.mT
+        across = torch.cholesky_solve(across_products, at.factor)
         information = J @ J.mT - across_products.mT @ across
-        gradient = (J @ r.mT - across.mT @ along).squeeze(2)
+        gradient = (J @ at.r.mT - across.mT @ at.along).squeeze(2)
         precision = self.precision[: x.shape[1]]
         covariance = torch.linalg.inv(information + torch.diag(precision))
         step = (covariance @ (gradient - x * precision).unsqueeze(2)).squeeze(2)
         return Linearisation(
-            whiten, transfer, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step
+            at.whiten,
+            at.transfer,
+            at.basis,
+            at.free_scale,
+            J,
+            at.factor,
+            across,
+            covariance,
+            x,
+            at.x0,
+            at.cost,
+            gradient,
+            step,
         )
 
     def _by_unknowns(
@@ -176,9 +250,7 @@ class WindowModel:
         if self.frequency.element_sensors and len(s.supports):
             direct = self.frequency.element_response(values, s.G)
             shown = shown + (direct @ noise[:, :, s.supports // 2].unsqueeze(3)).squeeze(3)
-        w = data.w.clone()
-        w[:, :, 0::2] += self.signals(noise)
-        w[:, :, 1::2] += self.signals(self.frequency.jw[:, None] * noise)
+        w = self._with_noise(data.w, noise)
         present = torch.as_tensor(np.flatnonzero(data.present))
         return replace(data, w=w), outputs + self.signals(shown[:, :, present])
 

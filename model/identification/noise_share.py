@@ -51,9 +51,10 @@ def _motions(model: WindowModel, values: ElementValues, transfer: Transfer, data
     of_drives, direct = moved_by_drives(model, values, transfer.compliance)
     kind = of_drives.dtype
     of_sensors = torch.linalg.pinv(model.signal_rows(data, kind) @ model.frequency.sensing(values))
-    beside = (direct * model.drive_noise[:, None]).expand(*of_drives.shape[:2], *direct.shape)
+    noise = model.instrument_noise[:, None]
+    beside = (direct * noise).expand(*of_drives.shape[:2], *direct.shape)
     none = beside.new_zeros(*beside.shape[:3], of_sensors.shape[3])
-    return torch.cat([of_drives * model.drive_noise[:, None], of_sensors], dim=3), torch.cat([beside, none], dim=3)
+    return torch.cat([of_drives * noise, of_sensors], dim=3), torch.cat([beside, none], dim=3)
 
 
 def moved_by_drives(model: WindowModel, values: ElementValues, compliance: Tensor) -> tuple[Tensor, Tensor]:

@@ -191,15 +191,22 @@ class Refiner:
     def _iterate(self, data: WindowBatch, progress: _Progress, rows: Tensor, wanted: Tensor) -> None:
         """A full linearisation and a chord step for the windows `rows`, whose data are given."""
         x, cost, best = progress.x[rows], progress.cost[rows], progress.best[rows]
+        data = self.model.with_lost(x, data)
         at = self.model.linearise(x, data)
         step = _limited(at.step)
+        data = self.model.with_lost(x + step, data)
         second = self.model.chord(at, x + step, at.state_after(step), data)
         worse = at.cost > cost * (1 + 1e-6) + _SLACK
         std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
         settled = (second.step.abs() / std).amax(dim=1) < _CONVERGED
         held = second.cost <= at.cost * (1 + 1e-6) + _SLACK + torch.where(settled, _PER_UNKNOWN * x.shape[1], 0.0)
+        further = _limited(second.step)
+        if self.model.lost:  # the products of before leave out what lost inputs did there, not what they do here
+            near = (at.step.abs() / std).amax(dim=1) < _CONVERGED
+            settled, further = settled & near, torch.where(near[:, None], further, 0.0)
+            held = held | ~near
         small = settled & held
-        forward = torch.where(held[:, None], x + step + _limited(second.step), x + step / 3)
+        forward = torch.where(held[:, None], x + step + further, x + step / 3)
         # A step that made things worse is taken back to a third.
         progress.x[rows] = torch.where(worse[:, None], best + (x - best) / 3, forward)
         progress.best[rows] = torch.where(worse[:, None], best, x)
@@ -237,6 +244,7 @@ class Refiner:
     ) -> Refined:
         self._weigh_unconverged(data, progress, rows, wanted)
         x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
+        data = self.model.with_lost(x, data)
         identifiable, noise = self._identifiable(data, x, torch.diagonal(covariance, dim1=1, dim2=2).sqrt())
         signals = len(self.model.compression.matrix(data.present))
         freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
@@ -274,7 +282,8 @@ class Refiner:
         """Evidence on deviations of windows that did not converge, at their last iterate."""
         left = (wanted[rows] & ~progress.weighed[rows]).nonzero().squeeze(1)
         if len(left):
-            chosen, x = data.take(left), progress.x[rows[left]]
+            x = progress.x[rows[left]]
+            chosen = self.model.with_lost(x, data.take(left))
             at = self.model.linearise(x, chosen)
             everything = torch.arange(len(left))
             self._weigh(everything, at, self.model.chord(at, x, at.x0, chosen), chosen, progress, rows[left])
@@ -290,8 +299,9 @@ class Refiner:
             chosen = data.take(weak)
             share = noise_share(self.model, self.model.linearise(x[weak], chosen), chosen)
             P = len(self.system.parameters)
-            noise[weak.numpy()] = mean_share(share[:, :P])
-            vague = (std[weak, P:] > WEAK_STD).any(dim=1) & (share[:, :P].mean(dim=1) > VAGUE_SHARE)
+            of_seen = share[:, :P][:, ~self.model.blind]
+            noise[weak.numpy()] = mean_share(of_seen)
+            vague = (std[weak, P:] > WEAK_STD).any(dim=1) & (of_seen.mean(dim=1) > VAGUE_SHARE)
             identifiable[weak] &= (share < NOISE_SHARE) & ~(vague[:, None] & (std[weak] > WEAK_STD))
         return identifiable, noise
 

@@ -419,17 +419,26 @@ def _between(change: float, common: float) -> bool:
 
 
 def counted(
-    stuck: Sequence[Stuck], found: Sequence[tuple[str, FaultKind, float]], time: int, most: int
+    stuck: Sequence[Stuck],
+    found: Sequence[tuple[str, FaultKind, float]],
+    time: int,
+    most: int,
+    unseen: tuple[str, ...] | None = None,
 ) -> tuple[Stuck, ...]:
-    """Counts of frozen, saturated, reversed and exchanged channels after a window that found some."""
+    """Counts of frozen, saturated, reversed and exchanged channels after a window that found some.
+
+    unseen: parameters that the window did not identify; None: it could not be used.
+    """
     old = {(s.channel, s.kind): s for s in stuck}
     now: dict[tuple[str, FaultKind], float] = {
         (channel, kind): value for channel, kind, value in found if kind in HARD_FAULTS
     }
     out = []
     for key in dict.fromkeys([*old, *now]):
-        s = old.get(key) or Stuck(key[0], key[1], now[key], 0, time)
+        s = old.get(key) or Stuck(key[0], key[1], now[key], 0, time, unseen or ())
         count = min(s.count + 1, most) if key in now else s.count - 1
+        if key in now and unseen is not None:
+            s = replace(s, unseen=tuple(name for name in s.unseen if name in unseen))
         if count > 0:
             out.append(replace(s, count=count, value=now.get(key, s.value)))
     return tuple(out)

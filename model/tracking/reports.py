@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -43,6 +44,7 @@ class ParameterReport:
     baseline_std: float | None
     drift: float | None  # value / baseline - 1
     drift_std: float | None
+    lost_with: str | None = None  # stuck channels, joined by |, without which it is not identifiable
 
 
 def reported(
@@ -52,22 +54,27 @@ def reported(
     base: FloatArray,
     drift: Drift,
     doubt: FloatArray,
+    lost: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[ParameterReport, ...]:
     """Every parameter in physical units, against nominal and against the vehicle's own baseline.
 
     base: log-ratios to nominal of the healthy state, (P,); doubt: variance of all log-ratios (P,) that is the same in
-    all windows: part of the stated uncertainty, not of that of changes.
+    all windows: part of the stated uncertainty, not of that of changes; lost: channels without which parameters are
+    not identifiable, by parameter.
     """
     log_std = np.sqrt(state.belief.level_variance + doubt)
     nominal = np.array([parameter.nominal for parameter in parameters])
     value, healthy = nominal * np.exp(state.belief.level), nominal * np.exp(base)
-    now = (value, value * log_std, value / nominal, state.belief.level, log_std, log_std < KNOWN * settings.prior)
+    there = np.array([p.name not in lost for p in parameters])
+    known = there & (log_std < KNOWN * settings.prior)
+    now = (value, value * log_std, value / nominal, state.belief.level, log_std, known)
     since = (healthy, healthy * np.sqrt(state.changes.baseline_variance), drift.whole, drift.std)
     learned = (state.changes.learned >= settings.learning).tolist()
-    return tuple(
+    reports = (
         ParameterReport(p.name, p.unit, p.nominal, *present, *(changed if known else _LEARNING))
         for p, present, changed, known in zip(parameters, _rows(now), _rows(since), learned, strict=True)
     )
+    return tuple(replace(r, lost_with=lost[r.name]) if r.name in lost else r for r in reports)
 
 
 def _rows(columns: Sequence[FloatArray | BoolArray]) -> Iterator[tuple[Any, ...]]:

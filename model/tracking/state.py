@@ -69,6 +69,7 @@ class Stuck:
     value: float
     count: int  # windows that said so, less those that did not; bounded
     since: int  # ns
+    unseen: tuple[str, ...] = ()  # parameters that no window has identified without it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +157,9 @@ class TrackerState:
                 changes=Changes(**_unpack_all(data["changes"])),
                 fit=MisfitFloor(**data["fit"]),
                 calibration=_calibration(data),
-                stuck=tuple(Stuck(**stuck) for stuck in data.get("stuck", ())),
+                stuck=tuple(
+                    Stuck(**{**stuck, "unseen": tuple(stuck.get("unseen", ()))}) for stuck in data.get("stuck", ())
+                ),
                 alarms=tuple(
                     Alarm(**{**alarm, "alternatives": tuple(alarm.get("alternatives", ()))}) for alarm in data["alarms"]
                 ),
@@ -212,13 +215,12 @@ def _calibration(data: Mapping[str, Any]) -> DeviationRecord:
     if "calibration" not in data:
         return deviations.start(len(data["names"]), model_of(()))
     arrays = _unpack_all(data["calibration"])
-    arrays.setdefault("origin", np.full(len(arrays["reference"]), np.nan))
-    unknown = np.full(len(arrays["reference"]), np.nan)  # `deviations.extended` knows what older states leave open
-    arrays = {"reference_variance": unknown, "following": unknown, "followed": unknown, "lately": unknown} | arrays
-    none = np.zeros(len(arrays["slope"]))
-    arrays = {"trend": none, "trend_curvature": none} | arrays
-    shape = len(data["names"]), len(arrays["reference"])
-    return DeviationRecord(**arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
+    size, none = len(arrays["reference"]), np.zeros(len(arrays["slope"]))
+    unknown = np.full(size, np.nan)  # `deviations.extended` knows what older states leave open
+    of_reference = ("origin", "reference_variance", "following", "followed", "lately")
+    older: dict[str, Any] = {name: unknown for name in of_reference} | {"trend": none, "trend_curvature": none}
+    shape = len(data["names"]), size
+    return DeviationRecord(**older | arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
 
 
 def _inflation(data: Mapping[str, Any]) -> VarianceInflation:

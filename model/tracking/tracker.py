@@ -275,7 +275,8 @@ class Tracker:
         """Every parameter in physical units, against nominal and against the vehicle's own baseline."""
         base = self._fusion.baseline(state)
         drift = self._fusion.drift(state, base)
-        return reported(self.parameters, state, self.settings, base, drift, self._model_uncertainty[0])
+        doubt = self._model_uncertainty[0]
+        return reported(self.parameters, state, self.settings, base, drift, doubt, self.lost(state))
 
     def health(self, state: TrackerState) -> Health:
         """NAMUR NE 107: the worst of what is active, in the recommendation's order F, C, S, M."""
@@ -294,7 +295,18 @@ class Tracker:
 
     def _stuck(self, state: TrackerState, estimate: Estimate, centre: int) -> tuple[Stuck, ...]:
         found = [(f.channel, f.kind, f.value) for f in estimate.faults]
-        return counted(state.stuck, found, centre, 2 * self.settings.rules.alarms.hard)
+        unseen = tuple(name for name, known in zip(self.names, estimate.identifiable, strict=True) if not known)
+        used = unseen if _is_usable(estimate) else None
+        return counted(state.stuck, found, centre, 2 * self.settings.rules.alarms.hard, used)
+
+    def lost(self, state: TrackerState) -> dict[str, str]:
+        """Channels, joined by |, without which a parameter is not identified, by its name; while they are stuck."""
+        found: dict[str, list[str]] = {}
+        for s in state.stuck:
+            if s.count >= self.settings.rules.alarms.hard:
+                for name in s.unseen:
+                    found.setdefault(name, []).append(s.channel)
+        return {name: "|".join(channels) for name, channels in found.items()}
 
     def hard_faults(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
         """Frozen, saturated, reversed and exchanged channels."""

@@ -150,6 +150,9 @@ class ParameterAnswer(BaseModel):
     drift_std: float | None
     alarm: Severity | None
     state: Literal["ok", "learning", "not_identifiable", "warning", "alarm"] | None = None
+    lost_with: str | None = Field(
+        default=None, description="stuck channels, joined by |, without which it is not identifiable"
+    )
 
 
 class AlarmAnswer(BaseModel):

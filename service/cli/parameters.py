@@ -40,16 +40,18 @@ def parameter_table(view: VehicleView, width: int = 120) -> Table:
             "nominal": quantity(p.nominal, p.unit),
             "ratio": f"{p.value / p.nominal:.3f}" if known else "–",
             "drift": percent(p.drift),
-            "state": _state(p.alarm, known, p.drift),
+            "state": _state(p.alarm, known, p.drift, p.lost_with),
         }
         colour = {"alarm": "red", "warning": "yellow"}.get(p.alarm or "")
         table.add_row(*(cells[name] for name in shown), style=colour)
     return table
 
 
-def _state(alarm: str | None, identifiable: bool, drift: float | None) -> str:
+def _state(alarm: str | None, identifiable: bool, drift: float | None, lost: str | None) -> str:
     if alarm is not None:
         return alarm
+    if lost is not None:
+        return f"{lost.replace('|', ' and ')} lost"
     if not identifiable:
         return "not identifiable"
     return "learning" if drift is None else "ok"

@@ -44,6 +44,7 @@ class ParameterView:
     drift: float | None  # value / baseline - 1
     drift_std: float | None
     alarm: str | None  # severity of its active alarm
+    lost_with: str | None = None  # stuck channels, joined by |, without which it is not identifiable
 
     def as_dict(self) -> dict[str, Any]:
         """JSON of the contract's section 4, with the drift beside it."""
@@ -60,7 +61,7 @@ class ParameterView:
             "drift_std": self.drift_std,
             "alarm": self.alarm,
             "state": self.state,
-        }
+        } | ({} if self.lost_with is None else {"lost_with": self.lost_with})
 
     @property
     def state(self) -> str:
@@ -175,6 +176,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
             r.drift,
             r.drift_std,
             alarmed.get(r.name) or (_of_kind(alarmed, r.name) if r.baseline is not None else None),
+            r.lost_with,
         )
         for r, p in zip(reports, engine.system.tracked, strict=True)
     )

@@ -133,7 +133,14 @@ def _sensors(sensors: Mapping[str, Mark], active: Sequence[AlarmRow]) -> list[Hi
 
 def _parameters(row: FleetRow, view: VehicleView, whole: int) -> list[Hint]:
     found = []
-    unknown = [p.name for p in view.parameters if p.state == "not_identifiable"]
+    lost = [p for p in view.parameters if p.lost_with is not None]
+    for channels in dict.fromkeys(p.lost_with for p in lost):
+        names = ", ".join(p.name for p in lost if p.lost_with == channels)
+        text = "Everything else is tracked, with the uncertainty that this leaves. Repair the sensor."
+        found.append(
+            Hint("warning", f"Not identifiable while {str(channels).replace('|', ' and ')} is lost: {names}", text)
+        )
+    unknown = [p.name for p in view.parameters if p.state == "not_identifiable" and p.lost_with is None]
     if unknown and whole:
         if row.windows["unfitting"] >= whole:
             text = "No window has fitted yet: this says nothing about the sensors. See why windows do not fit."

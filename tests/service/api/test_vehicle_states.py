@@ -7,7 +7,7 @@ from dataclasses import replace
 from sprung.model.signals import BuiltOtherwise
 from sprung.model.system import load_system
 from sprung.model.tracking.state import Alarm
-from sprung.service.monitoring.views import VehicleView, suspected
+from sprung.service.monitoring.views import ParameterView, VehicleView, suspected
 from sprung.service.pages.vehicle import sensor_marks
 from sprung.service.rendering.drawing import Mark
 from sprung.service.rendering.states import hints
@@ -67,3 +67,17 @@ def test_a_body_that_is_not_as_its_file_says_is_reported() -> None:
     (said,) = hints(ROW, view, [], [], False, sensor_marks(SYSTEM, view))
     assert said.level == "info"
     assert "bogie1 +2.4 % ± 0.6 % in mass" in said.text
+
+
+def test_an_element_is_said_to_be_unidentifiable_because_of_a_lost_input() -> None:
+    channels = "wheel_11r.displacement|wheel_11r.velocity"
+    spring = ParameterView(
+        "primary_11r.stiffness", "primary_11r", "stiffness", "N/m", 1.0, 1.0, 0.1, False, 1.0, 0.0, 0.1, None, channels
+    )
+    known = replace(spring, name="primary_11l.stiffness", element="primary_11l", identifiable=True, lost_with=None)
+    (said,) = hints(ROW, replace(VIEW, alarms=(), parameters=(spring, known)), [], [], False, {})
+    assert said.title == (
+        "Not identifiable while wheel_11r.displacement and wheel_11r.velocity is lost: primary_11r.stiffness"
+    )
+    assert spring.as_dict()["lost_with"] == channels and spring.state == "not_identifiable"
+    assert "lost_with" not in known.as_dict()

@@ -1,0 +1,157 @@
+"""Inputs that are lost: what they showed is left out of the likelihood, and everything else is identified as well as
+its deviation says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from sprung.model.identification.contradictions import Contradictions
+from sprung.model.identification.deviations import deviations
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.identification.identify import Identifier
+from sprung.model.identification.refine import Refined, Refiner
+from sprung.model.signals import FloatArray
+from sprung.model.system import BUNDLED, System, load_system
+from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
+from tests.tracker_windows import EPOCH
+
+SECOND = 1_000_000_000
+WHEEL = ("wheel_11r.displacement", "wheel_11r.velocity")
+ON_IT = {"primary_11r.stiffness", "primary_11r.damping"}
+
+
+def frozen(system: System, values: FloatArray, channels: tuple[str, ...], at: float | None) -> FloatArray:
+    """Windows (B, T, C) in which some channels stand still, at a value or at their mean."""
+    out, names = values.copy(), [channel.name for channel in system.channels]
+    for channel in channels:
+        column = names.index(channel)
+        out[:, :, column] = values[:, :, column].mean() if at is None else at
+    return out
+
+
+def without(system: System, values: FloatArray, lost: tuple[str, ...]) -> Refined:
+    """Windows refined without some channels of inputs."""
+    refiner = Refiner(replace(system, lost=frozenset(lost)), values.shape[1])
+    return refiner.refine(frozen(system, values, lost, 0.0))
+
+
+@cache
+def drawn(file: str) -> tuple[System, FloatArray, FloatArray]:
+    """A system, 32 windows of it, and the log-ratios of each."""
+    system = load_system(BUNDLED / file)
+    rng = np.random.default_rng(21)
+    truth = np.log(rng.uniform(0.8, 1.2, (32, len(system.parameters))))
+    return system, simulate_runs(system, truth, system.window, rng).values, truth
+
+
+@pytest.mark.parametrize(
+    ("file", "lost", "blind"),
+    [
+        ("manchester.yaml", WHEEL, ON_IT),
+        ("manchester.yaml", WHEEL[:1], set()),  # the other channel is enough
+        ("manchester.yaml", WHEEL[1:], set()),
+        ("axleboxes.yaml", ("wheel_22l.acceleration",), {"primary_22l.stiffness", "primary_22l.damping"}),
+    ],
+)
+def test_errors_are_as_stated_and_only_elements_on_a_lost_support_are_not_identifiable(
+    file: str, lost: tuple[str, ...], blind: set[str]
+) -> None:
+    system, values, truth = drawn(file)
+    found = without(system, values, lost)
+    names = np.array([p.name for p in system.parameters])
+    seen = ~np.isin(names, list(blind))
+    assert found.converged.mean() > 0.95
+    assert not found.identifiable[:, ~seen].any()
+    assert found.identifiable[:, seen].mean() > 0.98
+    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    errors = ((found.log_ratio - truth) / std)[:, seen][found.identifiable[:, seen]]
+    assert 0.85 < np.sqrt(np.mean(errors**2)) < 1.15
+    assert np.median(found.chi_square) == pytest.approx(1.0, abs=0.08)  # what is lost counts among what is fitted
+
+
+def test_what_a_lost_input_shows_does_not_matter() -> None:
+    system, values, _ = drawn("manchester.yaml")
+    refiner = Refiner(replace(system, lost=frozenset(WHEEL)), system.window)
+    still, wild = (refiner.refine(frozen(system, values[:4], WHEEL, at)) for at in (0.0, 1e3))
+    np.testing.assert_array_equal(still.log_ratio, wild.log_ratio)
+
+
+def test_a_lost_input_costs_what_it_determined_and_hardly_more() -> None:
+    """The other bogie is known as well as before; nothing is known better without an input."""
+    system, values, truth = drawn("manchester.yaml")
+    lost, whole = without(system, values[:8], WHEEL), Refiner(system).refine(values[:8], truth[:8])
+    ratio = np.sqrt(
+        np.diagonal(lost.covariance, axis1=1, axis2=2) / np.diagonal(whole.covariance, axis1=1, axis2=2)
+    ).mean(axis=0)
+    other = np.array(["primary_2" in p.name for p in system.parameters])
+    assert np.all(ratio[other] < 1.2)
+    assert np.all(ratio > 0.95)
+
+
+def test_sensors_that_contradict_each_other_are_found_beside_a_lost_input() -> None:
+    system, values, _ = drawn("manchester.yaml")
+    wrong = values[:2].copy()
+    wrong[..., 20] *= -1
+    wrong[..., :2] = np.nan
+    right = values[:2].copy()
+    right[..., :2] = np.nan
+    contradictions = Contradictions(Refiner(system).calibration, np.arange(28))
+    assert contradictions.contradicted(wrong).all()
+    assert not contradictions.contradicted(right).any()
+
+
+def followed(
+    tracker: Tracker, identifier: Identifier, state: TrackerState, values: FloatArray, first: int
+) -> TrackerState:
+    """State after windows that follow each other, from number `first` on, in batches as in the service."""
+    for at in range(0, len(values), 8):
+        windows = values[at : at + 8]
+        known = [tracker.known_faults(state)] * len(windows)
+        for k, estimate in enumerate(identifier.examine(windows, np.arange(len(windows)) % 2 == 0, known)):
+            state = tracker.update(state, estimate, EPOCH + (first + at + k) * SECOND)
+    return state
+
+
+@pytest.mark.parametrize("at", [None, pytest.param(4.0, marks=pytest.mark.slow)])
+def test_a_vehicle_stays_monitored_while_a_wheel_is_frozen(at: float | None) -> None:
+    """At its mean or far off: the wheel is named, a damper of the other bogie found, and nothing else accused."""
+    system, rng = load_system(), np.random.default_rng(5)
+    identifier, tracker = Identifier(system), Tracker(system.parameters, TrackerSettings(), deviations(system))
+    names = [p.name for p in system.parameters]
+    healthy = np.log(rng.uniform(0.9, 1.1, 24))
+    weak = healthy.copy()
+    weak[names.index("primary_22l.damping")] += np.log(0.75)
+
+    def ride(truth: FloatArray, windows: int) -> FloatArray:
+        return simulate_runs(system, np.tile(truth, (windows, 1)), system.window, rng).values
+
+    state = followed(tracker, identifier, tracker.initial_state(), ride(healthy, 60), 0)
+    assert state.alarms == () and not tracker.lost(state)
+    state = followed(tracker, identifier, state, frozen(system, ride(healthy, 20), WHEEL, at), 60)
+    state = followed(tracker, identifier, state, frozen(system, ride(weak, 80), WHEEL, at), 80)
+
+    kinds = {(a.kind, a.parameter) for a in state.alarms}
+    assert kinds == {("change", "primary_22l.damping"), *(("sensor", f"{channel}.frozen") for channel in WHEEL)}
+    assert state.coverage.monitored
+    report = {r.name: r for r in tracker.report(state)}
+    assert {name for name, r in report.items() if not r.identifiable} == ON_IT
+    assert {r.lost_with for name, r in report.items() if name in ON_IT} == {"|".join(WHEEL)}
+    assert all(r.lost_with is None for name, r in report.items() if name not in ON_IT)
+    for i, name in enumerate(names):
+        if name not in ON_IT:
+            assert abs(report[name].log_ratio - weak[i]) < 3 * report[name].log_std, name
+    change = report["primary_22l.damping"]
+    assert change.drift is not None and change.drift_std is not None
+    assert abs(change.drift + 0.25) < 3 * change.drift_std
+    state = TrackerState.from_dict(state.to_dict())
+
+    state = followed(tracker, identifier, state, ride(weak, 40), 160)  # repaired
+    assert {(a.kind, a.parameter) for a in state.active} == {("change", "primary_22l.damping")}
+    assert {(a.kind, a.parameter) for a in state.alarms} == kinds
+    assert not tracker.lost(state)
+    level, std = tracker.posterior(state)
+    assert np.abs((level - weak) / std).max() < 3
