@@ -19,6 +19,7 @@ from sprung.model.tracking.filter import Belief
 
 MEMORY = 0.3  # weight of the newest window in the mean sensitivities
 LATELY = 100  # windows that are searched for a drift, which the reference of a baseline may have followed until then
+TREND_MOST = 2.0  # deviations of one of them at most: one window is no drift
 LINEARISATION_ERROR = 0.5  # of the square of a gain: error of a window that was linearised without correcting the gain
 CORRECTED_GAIN = 0.06  # gain from which windows are corrected before they are linearised
 STOPPED = 5.0  # s without a used window after which passengers may have boarded
@@ -358,7 +359,8 @@ def _test_jumps(
     keep = np.where(lasting & (old * (rules.forgetting * old + along * bounded) > 0), rules.forgetting, 0.0)
     slope = keep * old + along * bounded
     curvature = keep * calibration.curvature + information
-    trend = (1 - 1 / LATELY) * calibration.trend + along * bounded
+    side = along * np.minimum(1.0, TREND_MOST * np.sqrt(information) / np.maximum(np.abs(along), 1e-300))
+    trend = (1 - 1 / LATELY) * calibration.trend + side
     trend_curvature = (1 - 1 / LATELY) * calibration.trend_curvature + information
     ratio = slope**2 / (2 * curvature)
     since = np.where((ratio >= rules.onset) & (calibration.ratio < rules.onset), time, calibration.since)

@@ -84,10 +84,10 @@ class Fusion:
             return replace(state, last=time_ns, rejected=state.rejected + 1, belief=belief), None
         belief, cargo = self._with_loads(state, belief, elapsed, conditions)
         share, weight = min(1.0, elapsed / self.settings.window), noise_weight(estimate.noise)
-        calibration = self._faded(state, elapsed)
-        belief, calibration, found, jump, agrees = self._with_deviations(
-            calibration, belief, found, time_ns, (share, weight)
-        )
+        faded = self._faded(state, elapsed)
+        belief, calibration, found, jump, agrees = self._with_deviations(faded, belief, found, time_ns, (share, weight))
+        if not self.armed(state):  # deviations are found, which the first windows had as well
+            calibration = replace(calibration, following=faded.following)
         if estimate.faults and not agrees:  # the window was corrected by a fault that the belief does not support yet
             undecided = replace(state, last=time_ns, rejected=state.rejected + 1)
             return replace(undecided, belief=belief, calibration=calibration), None

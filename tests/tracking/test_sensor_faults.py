@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sprung.model.identification.deviations import Deviation
-from sprung.model.signals import Deviating, Estimate, FloatArray
+from sprung.model.signals import Deviating, Estimate, FloatArray, MeasurementFault
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking.deviation_model import model_of
 from sprung.model.tracking.rules import TRACKING_RULES
@@ -350,3 +350,27 @@ def test_what_is_stated_of_a_gain_is_as_wrong_as_it_says(begins: int, to: float,
         assert np.mean(np.abs(errors) < 3) > 0.95
         assert 0.3 < np.sqrt(np.mean(errors**2)) < 1.6
         assert np.abs(errors[-5:]).max() < 3
+
+
+def test_a_gain_that_is_found_beyond_its_prior_in_the_first_windows_belongs_to_the_baseline() -> None:
+    rng, tracker = np.random.default_rng(12), make(GAINS)
+    gains, state = np.array([0.1, 0, 0, 0, 0, 0]), tracker.initial_state()
+    for k in range(120):
+        window = gained(rng, gains, information=0.002**-2)
+        if k == 0:  # found by identification, and not believed yet
+            window = replace(window, faults=(MeasurementFault("c0", "gain", 1.1),))
+        state = tracker.update(state, window, EPOCH + k * SECOND)
+    reference = state.calibration.reference
+    assert reference[0] - np.median(reference) == pytest.approx(0.1, abs=0.005)
+    assert not state.changes.active.any()
+    assert not [a for a in state.alarms if a.kind != "sensor"]
+
+
+def test_one_window_that_lies_far_off_is_no_drift() -> None:
+    rng, tracker, stds = np.random.default_rng(13), make(GAINS), []
+    for odd in (0.0, 0.045):  # one of two vehicles has an odd window among its first
+        state = tracker.initial_state()
+        for k in range(8):
+            state = tracker.update(state, gained(rng, np.array([odd * (k == 3), 0, 0, 0, 0, 0])), EPOCH + k * SECOND)
+        stds.append(tracker.model.relative_std(state.belief.covariance[-6:, -6:])[0])
+    assert stds[1] == pytest.approx(stds[0], rel=0.01)
