@@ -32,6 +32,8 @@ from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
 _DAMPING = (1e-6, 1e3)  # first and most, of the scaled normal equations
+_MUCH = 0.03  # of chi-square, that a step promises: if it fails, its initial state is estimated anew
+_STARTS, _LOWER = 5, 0.01  # of these, at most, while each lowers the objective by this share
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,8 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
         if proposed.value >= state.value and promised < rules.numerical * grain:
             left = promised
             break
+        if promised > _MUCH * float(state.lin.residual @ state.lin.residual):
+            proposed = _lower_by_its_start(problem, proposed, state.value)
         rise = proposed.value - state.value
         if 0 <= rise < rules.smoothing * float(state.lin.residual @ state.lin.residual) and not problem.process_noise:
             state = replace(state, working=working, value=_value_under(problem, state, working))
@@ -225,6 +229,24 @@ def _begun_anew(problem: Problem, state: _State) -> _State:
     step = np.linalg.lstsq(columns, state.lin.residual, rcond=None)[0]
     other = _state(problem, replace(state.point, state=state.point.state + step), state.working)
     return other if other.value < state.value else state
+
+
+def _lower_by_its_start(problem: Problem, proposed: _State, below: float) -> _State:
+    """A proposal above the present value, with its initial state estimated anew until it is below.
+
+    Sensitivities hold beside a free motion: the motion that laws answer with is periodic in them, and not in the model.
+    Laws that dominate a slowly decaying motion turn steps in the right direction uphill for this reason alone.
+    """
+    if proposed.lin.forces is None or problem.process_noise:
+        return proposed
+    for _ in range(_STARTS):
+        if proposed.value < below:
+            break
+        other = _begun_anew(problem, proposed)
+        if other.value > proposed.value - _LOWER * abs(proposed.value):
+            break
+        proposed = other
+    return proposed
 
 
 def _value(problem: Problem, residual: FloatArray, log_det: float, point: Point) -> float:

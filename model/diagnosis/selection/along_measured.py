@@ -17,12 +17,13 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.diagnosis.selection.starts import joint_start, wider_starts
+from sprung.model.diagnosis.selection.starts import joint_start, seen, wider_starts
 from sprung.model.laws import ElementLaw
 from sprung.model.schema import ForceInput
 from sprung.model.system import System
 
-_STEPS = 8  # of a fit along the measured motion
+_STEPS, _ROUNDS = 8, 5  # of a fit along the measured motion, and how often it goes on
+_BLUNT = 0.25  # of the rms rate, width of a corner from which a fit sharpens it
 _PER_MASS = 1.0  # m/s^2, first level of the unmeasured forces over the masses they act on
 
 
@@ -73,23 +74,36 @@ class MeasuredMotion:
         """
         if not evaluated_in_time(candidate.term):
             return []
-        fit = try_optimise(self.problem, joint_start(self.problem, self.fit, candidate), _STEPS)
+        begun = joint_start(self.problem, self.fit, candidate)
+        fit = self._fitted(begun)
         if fit is None:
             return []
         beside = MeasuredMotion(*refreshed(self.problem, fit))  # what is left unmeasured beside it
         wide = beside.wider(len(fit.point.terms) - 1)
         points = [beside.fit.point] if wide is None else [beside.fit.point, wide]
-        return [*points, *(blunt for point in points for blunt in _blunter(point))]
+        return [_blunt(beside.fit, point) for point in points]
+
+    def _fitted(self, start: Point) -> Fit | None:
+        """A fit along the measured motion, to convergence; None if it diverges."""
+        fit = try_optimise(self.problem, start, _STEPS)
+        for _ in range(_ROUNDS):
+            if fit is None or fit.converged:
+                break
+            fit = try_optimise(self.problem, fit.point, _STEPS) or fit
+        return fit
 
 
-def _blunter(point: Point) -> list[Point]:
-    """A point with the corner of its last law twice as wide: simulations along sharp ones are rough functions of it."""
+def _blunt(fit: Fit, point: Point) -> Point:
+    """A point with a wide corner of its last law, if it has one: a fit sharpens it (graduated optimisation).
+
+    Simulations along sharp corners are rough functions of all values, whose steps mislead.
+    """
     term = point.terms[-1]
     if not isinstance(term.law, ElementLaw) or term.law.corner is None:
-        return []
+        return point
     values = np.array(term.parameters)
-    values[term.law.corner] *= 2.0
-    return [replace(point, terms=(*point.terms[:-1], term.at(values)))]
+    values[term.law.corner] = max(values[term.law.corner], _BLUNT * seen(fit, term).rate_rms)
+    return replace(point, terms=(*point.terms[:-1], term.at(values)))
 
 
 def with_disturbances(system: System) -> System:

@@ -171,22 +171,22 @@ def wider_starts(base: Fit, index: int) -> Iterator[Point]:
     wider = law.wider
     if wider is None or wider.widened is None:
         return
-    seen = _seen(base, term)
-    scales = tuple(max(abs(spec.typical(seen)), 1e-12) for spec in wider.parameters)
+    motion = seen(base, term)
+    scales = tuple(max(abs(spec.typical(motion)), 1e-12) for spec in wider.parameters)
     known: dict[str, float] = {}
     for other in base.point.terms:
         if other.location == term.location and other is not term:
             known |= zip(other.law.names, other.parameters, strict=True)
     further = wider.names[len(term.parameters) :]
     starts = [(*term.parameters, *(known[name] for name in further))] if known.keys() >= {*further} else []
-    for values in (*starts, *wider.widened(term.parameters, seen)):
+    for values in (*starts, *wider.widened(term.parameters, motion)):
         clipped = tuple(float(value) for value in wider.clip(values))
         moved = replace(term, law=wider, parameters=clipped, scales=scales, variant=WIDER, fixed=())
         terms = (*base.point.terms[:index], moved, *base.point.terms[index + 1 :])
         yield replace(base.point, terms=terms)
 
 
-def _seen(base: Fit, term: Term) -> Observed:
+def seen(base: Fit, term: Term) -> Observed:
     """The motion of a term's element."""
     port, thin = term.port(base.forward.system), slice(None, None, OVERSAMPLING)
     d, v = (motion[thin] @ port for motion in base.element_motion)
