@@ -295,6 +295,10 @@ class Fusion:
         known = belief.covariance[row, row] < (KNOWN * self.limit[at[0]]) ** 2
         return float(belief.mean[row]) if known else None
 
+    def pending_variance(self, state: TrackerState) -> FloatArray:
+        """Variance (P,) of levels for jumps that are suspected, but not found yet."""
+        return state.innovation.pending_variance(self.weather.group)
+
     def armed(self, state: TrackerState) -> bool:
         """Whether the vehicle has a baseline; before, deviations are found but cannot have jumped."""
         return bool(np.any(state.changes.learned >= self.settings.learning))
@@ -325,6 +329,7 @@ class Fusion:
                 + weathers.settled_effect(state.weather, self.weather)
             )
         variance = dev.level_variance(state.belief, self.model, state.calibration.base_cross)
+        variance = variance + self.pending_variance(state)
         spread = np.sqrt(variance + state.changes.baseline_variance)
         return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
 

@@ -58,8 +58,8 @@ def reported(
 ) -> tuple[ParameterReport, ...]:
     """Every parameter in physical units, against nominal and against the vehicle's own baseline.
 
-    base: log-ratios to nominal of the healthy state, (P,); doubt: variance of all log-ratios (P,) that is the same in
-    all windows: part of the stated uncertainty, not of that of changes; lost: channels without which parameters are
+    base: log-ratios to nominal of the healthy state, (P,); doubt: variance of all log-ratios (P,) beside that of
+    the belief: part of the stated uncertainty, not of that of changes; lost: channels without which parameters are
     not identifiable, by parameter.
     """
     log_std = np.sqrt(state.belief.level_variance + doubt)

@@ -153,7 +153,7 @@ class TrackerState:
                 outliers=data["outliers"],
                 belief=_belief(data),
                 inflation=_inflation(data),
-                innovation=InnovationCusum(**_unpack_all(data["surprise"])),
+                innovation=_innovation(data),
                 changes=Changes(**_unpack_all(data["changes"])),
                 fit=MisfitFloor(**data["fit"]),
                 calibration=_calibration(data),
@@ -208,6 +208,13 @@ def _belief(data: Mapping[str, Any]) -> Belief:
     full[upper] = covariance
     full.T[upper] = covariance
     return Belief(mean, full, len(mean) - 2 * len(data["names"]))
+
+
+def _innovation(data: Mapping[str, Any]) -> InnovationCusum:
+    """Older states do not say how far off the last windows were."""
+    arrays = _unpack_all(data["surprise"])
+    none = np.zeros(len(data["names"]))
+    return InnovationCusum(**{"score": none, "windows": none, "offset": none} | arrays)
 
 
 def _calibration(data: Mapping[str, Any]) -> DeviationRecord:

@@ -269,13 +269,14 @@ class Tracker:
 
     def posterior(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the log-ratios to nominal, each of shape (P,)."""
-        return state.belief.level.copy(), np.sqrt(state.belief.level_variance + self._model_uncertainty[0])
+        variance = state.belief.level_variance + self._fusion.pending_variance(state)
+        return state.belief.level.copy(), np.sqrt(variance + self._model_uncertainty[0])
 
     def report(self, state: TrackerState) -> tuple[ParameterReport, ...]:
         """Every parameter in physical units, against nominal and against the vehicle's own baseline."""
         base = self._fusion.baseline(state)
         drift = self._fusion.drift(state, base)
-        doubt = self._model_uncertainty[0]
+        doubt = self._model_uncertainty[0] + self._fusion.pending_variance(state)
         return reported(self.parameters, state, self.settings, base, drift, doubt, self.lost(state))
 
     def health(self, state: TrackerState) -> Health:
