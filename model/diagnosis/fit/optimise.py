@@ -237,10 +237,11 @@ def _lower_by_its_start(problem: Problem, proposed: _State, below: float) -> _St
     Sensitivities hold beside a free motion: the motion that laws answer with is periodic in them, and not in the model.
     Laws that dominate a slowly decaying motion turn steps in the right direction uphill for this reason alone.
     """
-    if proposed.lin.forces is None or problem.process_noise:
+    if problem.process_noise:
         return proposed
     for _ in range(_STARTS):
-        if proposed.value < below:
+        forces = proposed.lin.forces
+        if proposed.value < below or forces is None or not forces.converged:
             break
         other = _begun_anew(problem, proposed)
         if other.value > proposed.value - _LOWER * abs(proposed.value):

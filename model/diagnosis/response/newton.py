@@ -26,6 +26,7 @@ _RUN_IN = 1.5  # time constants of the slowest mode, integrated before a segment
 _STEP = 1e-3  # of a motion's standard deviation, for finite differences
 _EVALUATIONS = 30  # of a law, whose cost equals that of one correction
 _SEGMENTS = 1e5  # segments times states cubed at which arithmetic costs as much as the calls
+_CALLS = 16.0  # cost of a step of all segments over that of composing one, where calls count
 _RELATIVE_COST = 2.0  # of a multiple-shooting step over one of single shooting
 
 FirstOrderHold = tuple[
@@ -90,7 +91,7 @@ def periodic_response(hold: FirstOrderHold, gains: FloatArray, defect: FloatArra
     """
     total, states = len(defect), len(hold[0])
     before = int(min(np.ceil(memory), total))
-    count = int(np.clip(_SEGMENTS / states**3, 4, total // 4))
+    count = int(np.clip(min(_SEGMENTS / states**3, np.sqrt(_CALLS * total)), 4, total // 4))
     inverse = np.linalg.inv(np.eye(defect.shape[1]) - gains @ hold[2])  # (T, m, m)
     rows, right = inverse @ gains, (inverse @ defect[:, :, None])[:, :, 0]
     with np.errstate(all="ignore"):  # diverging corrections are rejected by the caller

@@ -31,7 +31,7 @@ from sprung.model.diagnosis.selection.evidence import (
 )
 from sprung.model.diagnosis.selection.starts import alike_starts, starts_of
 
-_ALONG = 20  # steps from a start along the measured motion; corners become sharp within them
+_STEPS, _SHARPENED = 6, 20  # from a start along the measured motion; in which a blunt corner becomes sharp
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,8 @@ def _initial_fit(
     starts = starts_of(problem, base, candidate)
     tried = [t for t in (_try(problem, base, candidate, start, 3) for start in starts) if t is not None]
     along = [] if measured is None else measured.starts(candidate)
-    tried += [t for t in (_try(exact, base, candidate, start, _ALONG) for start in along) if t is not None]
+    steps = _STEPS if getattr(candidate.term.law, "corner", None) is None else _SHARPENED
+    tried += [t for t in (_try(exact, base, candidate, start, steps) for start in along) if t is not None]
     best = max(tried, key=lambda t: t.evidence, default=None)
     if again and (best is None or _leaves_much(problem, best)):
         others = (_try(problem, base, candidate, start, 3) for start in alike_starts(base, candidate))
