@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.signal import resample_poly
 
 from sprung.model.diagnosis.api import diagnose
 from sprung.model.diagnosis.fit.baseline import baseline
@@ -13,6 +14,7 @@ from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import try_optimise
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise
+from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate
@@ -43,8 +45,11 @@ class Earthquake:
     lost: int = 0
 
 
-def earthquake(seconds: float = 20.0, fine: int = 40) -> Earthquake:
-    """Ground acceleration like an earthquake's, and the slab's acceleration and slide, by steps of 0.25 ms."""
+def earthquake(seconds: float = 20.0, fine: int = 40, slow: float = SLOW, *, filtered: bool = False) -> Earthquake:
+    """Ground acceleration like an earthquake's, and the slab's acceleration and slide, by steps of 0.25 ms.
+
+    slow: friction at creeping rates, N.  filtered: whether the slab's channels pass an anti-alias filter.
+    """
     random, samples = np.random.default_rng(4), int(seconds * RATE)
     time, frequency = np.arange(samples) / RATE, np.fft.rfftfreq(samples, 1 / RATE)
     shape = (frequency > 0.25) / np.sqrt((1 - (frequency / 2.5) ** 2) ** 2 + (frequency / 2) ** 2)
@@ -55,12 +60,12 @@ def earthquake(seconds: float = 20.0, fine: int = 40) -> Earthquake:
     x = v = 0.0
     shown, step = np.empty((samples * fine, 2)), 1 / (RATE * fine)
     for i, pushed in enumerate(ground):
-        friction = np.tanh(v / 1e-3) * (FAST + (SLOW - FAST) * np.exp(-abs(v) / CHANGES))
+        friction = np.tanh(v / 1e-3) * (FAST + (slow - FAST) * np.exp(-abs(v) / CHANGES))
         a = -(MASS * 9.81 / RADIUS * x + 300.0 * v + friction) / MASS
         shown[i] = a, x
         v += step * (a - pushed)
         x += step * v
-    values = np.column_stack([quake, shown[::fine]])
+    values = np.column_stack([quake, resample_poly(shown, 1, fine, axis=0) if filtered else shown[::fine]])
     return Earthquake(values + random.standard_normal(values.shape) * [0.003, 0.003, 2e-5])
 
 
@@ -81,6 +86,22 @@ def test_what_is_fitted_along_the_measured_motion_begins_near_the_truth() -> Non
     simulated = try_optimise(problem, wide, 20, base.whitener)
     assert simulated is not None and float(np.max(misfit(simulated))) < 1e-3
     assert simulated.point.terms[-1].parameters[0] == pytest.approx(FAST, rel=0.01)
+
+
+def test_a_step_is_not_rejected_for_the_free_motion_beside_it_alone() -> None:
+    """A slowly decaying motion that friction dominates: no step from there was accepted, the right ones included."""
+    system, record = parse_system(SLAB), earthquake(slow=FAST, filtered=True)
+    signals = prepare(system, record.values, RATE).signals
+    problem, base = baseline(system, signals, declared_noise(system, signals), signals.samples)
+    truth = np.log([MASS * 9.81 / RADIUS / 6500, 300 / 1500])
+    blunt = Term(COULOMB_FRICTION, "bearing", (760.0, 0.04), scales=(300.0, 0.01))
+    start = Point(truth + 0.03, (blunt,), np.zeros(2))
+    begun, fit = (try_optimise(problem, start, steps, base.whitener) for steps in (1, 12))
+    assert begun is not None and fit is not None
+    assert fit.reduced < 0.1 * begun.reduced
+    force, corner = fit.point.terms[0].parameters
+    assert force == pytest.approx(FAST, rel=0.03) and corner < 0.01  # 1e-3, far below the rate's change in a sample
+    assert fit.point.theta[0] == pytest.approx(truth[0], abs=0.01)
 
 
 @pytest.mark.slow
