@@ -61,7 +61,7 @@ def judged(
         rejected=rejected,
         lost_phase=lost,
         nothing_fits=rejected or (unknown and lost and error**2 > rules.gross),
-        parts=changed_parts(state) if other else 0,
+        parts=changed_parts(state) + (len(faulty(state)) if state.calibrations else 0) if other else 0,
         carried=_carries(verdict, physics),
         ended=ended,
         place=_place(state),
@@ -122,16 +122,18 @@ def changed_parts(state: Investigation) -> int:
 
 
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
-    """Whether so many structural changes were found that they imitate another structure than the file's.
+    """Whether so many changes were found that they imitate another structure than the file's.
 
-    More than a few in any case, more than one if they leave a significant error (`errors`).
+    More structural ones than a few in any case, more than one if they leave a significant error (`errors`).  Masses and
+    instruments off beyond their tolerances count, too, where they are most of all, or leave such an error.
     """
     rules, parts = state.options.rules.verdict, changed_parts(state)
-    if parts < 2 or errors is None:
+    if errors is None or parts > rules.parts:
         return parts > rules.parts
+    off = len(faulty(state)) if state.calibrations else 0
     share = errors.explained(rules)
     left = bool(np.any(errors.unexplained(rules) > 0)) and share is not None and share < 1 - rules.parts_leave
-    return left or parts > rules.parts
+    return 2 * off > (state.calibrations or 1) or (left and (parts > 1 or parts + off > rules.parts))
 
 
 def bounded(state: Investigation) -> Noise:

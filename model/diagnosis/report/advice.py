@@ -24,7 +24,7 @@ def nothing_fits(outcome: Outcome) -> str:
     if judgement.parts:
         return (
             f"the structure is another one than the file's: {judgement.parts} changes of it (connections, masses, "
-            f"elements elsewhere) were found, which together imitate any other, and still err by "
+            f"elements elsewhere, instruments) were found, which together imitate any other, and still err by "
             f"{100 * judgement.error:.0f} % of the signal; bodies, their degrees of freedom and what joins them should "
             "be stated anew"
         )

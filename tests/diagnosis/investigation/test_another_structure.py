@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sprung.model.diagnosis.investigation import judgement
 from sprung.model.diagnosis.investigation.judgement import another_structure
 from sprung.model.diagnosis.investigation.setup_effects import SIGN_REVERSED, WRONG_BODY
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors
@@ -22,6 +23,7 @@ def investigation(laws: list[str], moved: bool) -> Any:
         options=SimpleNamespace(rules=RULES),
         setup_faults=[SimpleNamespace(effect=effect) for effect in effects],
         found=found,
+        calibrations=None,
     )
 
 
@@ -39,3 +41,25 @@ def test_changes_of_the_structure_are_named_when_they_are_few(
 ) -> None:
     errors = HeldOutErrors(np.array([0.8]), np.array([after]), np.array([0.02]))
     assert another_structure(investigation(laws, moved), errors) is other
+
+
+@pytest.mark.parametrize(
+    ("off", "of_all", "laws", "after", "other"),
+    [
+        (3, 16, [], 0.20, True),  # three that leave 6 % of the power
+        (3, 16, [], 0.02, False),
+        (2, 16, [], 0.20, False),
+        (1, 16, ["missing_connection"], 0.20, False),
+        (2, 16, ["missing_connection"], 0.20, True),
+        (9, 16, [], 0.02, True),  # most of them, however well they fit
+    ],
+)
+def test_many_masses_and_instruments_that_are_off_at_once_are_another_structure(
+    off: int, of_all: int, laws: list[str], after: float, other: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(judgement, "faulty", lambda state: list(range(off)))
+    state = investigation(laws, False)
+    state.calibrations = of_all
+    errors = HeldOutErrors(np.array([0.8]), np.array([after]), np.array([0.02]))
+    assert another_structure(state, errors) is other
+    assert another_structure(state) is False  # while findings are sought
