@@ -32,6 +32,7 @@ from sprung.model.diagnosis.investigation.widened import (
 )
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.diagnosis.selection.along_measured import sharpened
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.plausible import doubt, hardly_there
 
@@ -192,6 +193,10 @@ def _refitted(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple
     """The model with the chosen law and noise levels estimated anew, and the variant of the law that fits best then."""
     fit = chosen.fit if chosen.named else _with_surface(state, chosen.fit)
     problem, fit = refreshed(state.problem, with_free_gains(state, fit))
+    gross = not problem.process_noise and float(np.sqrt(np.mean(misfit(state.fit)))) > problem.rules.selection.gross
+    if gross:
+        fit = sharpened(problem, fit)
+        problem, fit = refreshed(problem, fit)
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
     if not fit.converged and not problem.process_noise:

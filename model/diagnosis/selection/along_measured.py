@@ -15,7 +15,7 @@ from sprung.model.diagnosis.fit.baseline import refreshed, with_force_noise
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import evaluated_in_time
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.starts import joint_start, seen, wider_starts
 from sprung.model.laws import ElementLaw
@@ -23,7 +23,9 @@ from sprung.model.schema import ForceInput
 from sprung.model.system import System
 
 _STEPS, _ROUNDS = 8, 5  # of a fit along the measured motion, and how often it goes on
-_BLUNT = 0.25  # of the rms rate, width of a corner from which a fit sharpens it
+SHARPENED = 20  # steps of a simulation, in which a blunt corner becomes sharp
+_BLUNT, _LESS_BLUNT = 0.25, 0.1  # of the rms rate, widths of corners from which a simulation's fit sharpens them
+_SHARP = 0.01  # the same along the measured motion, which corners do not change
 _PER_MASS = 1.0  # m/s^2, first level of the unmeasured forces over the masses they act on
 
 
@@ -75,7 +77,7 @@ class MeasuredMotion:
         if not evaluated_in_time(candidate.term):
             return []
         begun = joint_start(self.problem, self.fit, candidate)
-        fit = self._fitted(begun)
+        fit = self.fitted(begun)
         if fit is None:
             return []
         beside = MeasuredMotion(*refreshed(self.problem, fit))  # what is left unmeasured beside it
@@ -83,7 +85,7 @@ class MeasuredMotion:
         points = [beside.fit.point] if wide is None else [beside.fit.point, wide]
         return [_blunt(beside.fit, point) for point in points]
 
-    def _fitted(self, start: Point) -> Fit | None:
+    def fitted(self, start: Point) -> Fit | None:
         """A fit along the measured motion, to convergence; None if it diverges."""
         fit = try_optimise(self.problem, start, _STEPS)
         for _ in range(_ROUNDS):
@@ -91,6 +93,28 @@ class MeasuredMotion:
                 break
             fit = try_optimise(self.problem, fit.point, _STEPS) or fit
         return fit
+
+
+def sharpened(problem: Problem, fit: Fit) -> Fit:
+    """A fit whose last law has a corner, begun once more from where the whole model fits the measured motion.
+
+    Simulations along sharp corners have many local optima; the fit of the lowest chi-square is returned.
+    """
+    term = fit.point.terms[-1]
+    if not isinstance(term.law, ElementLaw) or term.law.corner is None:
+        return fit
+    measured = MeasuredMotion.of(problem, fit)
+    along = None if measured is None else measured.fitted(_with_corner(measured.fit, term, _SHARP))
+    if measured is None or along is None:
+        return fit
+    for _ in range(2):  # what is left unmeasured falls by orders beside a law that is right
+        measured = MeasuredMotion(*refreshed(replace(measured.problem, noise=along.noise), along))
+        along = measured.fit
+    starts = [_with_corner(along, along.point.terms[-1], width) for width in (_BLUNT, _LESS_BLUNT)]
+    tried = [try_optimise(problem, start, SHARPENED, fit.whitener) for start in starts]
+    best = min((one for one in (fit, *tried) if one is not None), key=lambda one: one.chi_square)
+    on = None if best is fit or best.converged else try_optimise(problem, best.point, SHARPENED, fit.whitener)
+    return best if on is None or on.chi_square >= best.chi_square else on
 
 
 def _blunt(fit: Fit, point: Point) -> Point:
@@ -101,9 +125,20 @@ def _blunt(fit: Fit, point: Point) -> Point:
     term = point.terms[-1]
     if not isinstance(term.law, ElementLaw) or term.law.corner is None:
         return point
-    values = np.array(term.parameters)
-    values[term.law.corner] = max(values[term.law.corner], _BLUNT * seen(fit, term).rate_rms)
-    return replace(point, terms=(*point.terms[:-1], term.at(values)))
+    wide, corner = _with_corner(fit, term, _BLUNT).terms[-1], term.law.corner
+    return point if wide.parameters[corner] < term.parameters[corner] else _ending(point, wide)
+
+
+def _with_corner(fit: Fit, term: Term, share: float) -> Point:
+    """The point of a fit with its last term exchanged for one whose corner is a share of the rms rate wide."""
+    values, corner = np.array(term.parameters), term.element_law.corner
+    assert corner is not None, f"{term.law.name} has no corner"
+    values[corner] = share * seen(fit, term).rate_rms
+    return _ending(fit.point, term.at(values))
+
+
+def _ending(point: Point, term: Term) -> Point:
+    return replace(point, terms=(*point.terms[:-1], term))
 
 
 def with_disturbances(system: System) -> System:

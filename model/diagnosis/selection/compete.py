@@ -19,7 +19,7 @@ from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.rules import RULES, EvidenceRules, Rules, SelectionRules
 from sprung.model.diagnosis.screening.score import Candidate, Screening
-from sprung.model.diagnosis.selection.along_measured import MeasuredMotion
+from sprung.model.diagnosis.selection.along_measured import SHARPENED, MeasuredMotion
 from sprung.model.diagnosis.selection.evidence import (
     bic,
     chance,
@@ -31,7 +31,7 @@ from sprung.model.diagnosis.selection.evidence import (
 )
 from sprung.model.diagnosis.selection.starts import alike_starts, starts_of
 
-_STEPS, _SHARPENED = 6, 20  # from a start along the measured motion; in which a blunt corner becomes sharp
+_STEPS = 6  # from a start along the measured motion
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ def _initial_fit(
     starts = starts_of(problem, base, candidate)
     tried = [t for t in (_try(problem, base, candidate, start, 3) for start in starts) if t is not None]
     along = [] if measured is None else measured.starts(candidate)
-    steps = _STEPS if getattr(candidate.term.law, "corner", None) is None else _SHARPENED
+    steps = _STEPS if getattr(candidate.term.law, "corner", None) is None else SHARPENED
     tried += [t for t in (_try(exact, base, candidate, start, steps) for start in along) if t is not None]
     best = max(tried, key=lambda t: t.evidence, default=None)
     if again and (best is None or _leaves_much(problem, best)):
