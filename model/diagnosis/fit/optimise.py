@@ -174,7 +174,7 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
         if proposed.value >= state.value and promised < rules.numerical * grain:
             left = promised
             break
-        if promised > _MUCH * float(state.lin.residual @ state.lin.residual):
+        if not unforced and promised > _MUCH * float(state.lin.residual @ state.lin.residual):
             proposed = _lower_by_its_start(problem, proposed, state.value)
         rise = proposed.value - state.value
         if 0 <= rise < rules.smoothing * float(state.lin.residual @ state.lin.residual) and not problem.process_noise:
