@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.signals import FloatArray
 
@@ -18,6 +19,11 @@ def misfit(fit: Fit) -> FloatArray:
 def total_misfit(fit: Fit) -> float:
     """Misfit of all sensors together."""
     return float(np.sum(misfit(fit)))
+
+
+def is_gross(problem: Problem, fit: Fit) -> bool:
+    """Whether a simulated motion is far from the measured one; motions that are smoothed never are."""
+    return not problem.process_noise and float(np.sqrt(np.mean(misfit(fit)))) > problem.rules.selection.gross
 
 
 def relative(error: ComplexArray, measured: ComplexArray) -> FloatArray:

@@ -118,6 +118,10 @@ class _State:
     lin: Linearised
     value: float  # of the objective
 
+    @property
+    def chi_square(self) -> float:
+        return float(self.lin.residual @ self.lin.residual)
+
 
 def try_optimise(problem: Problem, start: Point, iterations: int, whitener: Whitener | None = None) -> Fit | None:
     """As `optimise`; None if the fit diverges or the budget of work is exhausted."""
@@ -174,10 +178,10 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
         if proposed.value >= state.value and promised < rules.numerical * grain:
             left = promised
             break
-        if not unforced and promised > _MUCH * float(state.lin.residual @ state.lin.residual):
+        if not (unforced or problem.process_noise) and promised > _MUCH * state.chi_square:
             proposed = _lower_by_its_start(problem, proposed, state.value)
         rise = proposed.value - state.value
-        if 0 <= rise < rules.smoothing * float(state.lin.residual @ state.lin.residual) and not problem.process_noise:
+        if 0 <= rise < rules.smoothing * state.chi_square and not problem.process_noise:
             state = replace(state, working=working, value=_value_under(problem, state, working))
         if proposed.value < state.value:
             left = state.value - proposed.value
@@ -198,8 +202,7 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
 def _grain(problem: Problem, state: _State) -> float:
     """Decrease of the objective that matters: a share of it where the misfit exceeds noise."""
     rows, columns = state.lin.jacobian.shape
-    chi_square = float(state.lin.residual @ state.lin.residual)
-    return 1.0 if problem.process_noise else max(1.0, chi_square / max(1, rows - columns))
+    return 1.0 if problem.process_noise else max(1.0, state.chi_square / max(1, rows - columns))
 
 
 def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[Point, Working]:
@@ -237,8 +240,6 @@ def _lower_by_its_start(problem: Problem, proposed: _State, below: float) -> _St
     Sensitivities hold beside a free motion: the motion that laws answer with is periodic in them, and not in the model.
     Laws that dominate a slowly decaying motion turn steps in the right direction uphill for this reason alone.
     """
-    if problem.process_noise:
-        return proposed
     for _ in range(_STARTS):
         forces = proposed.lin.forces
         if proposed.value < below or forces is None or not forces.converged:

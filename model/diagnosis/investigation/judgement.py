@@ -61,7 +61,7 @@ def judged(
         rejected=rejected,
         lost_phase=lost,
         nothing_fits=rejected or (unknown and lost and error**2 > rules.gross),
-        parts=changed_parts(state) + (len(faulty(state)) if state.calibrations else 0) if other else 0,
+        parts=changed_parts(state) + _out_of_order(state) if other else 0,
         carried=_carries(verdict, physics),
         ended=ended,
         place=_place(state),
@@ -121,6 +121,11 @@ def changed_parts(state: Investigation) -> int:
     return moved + sum(found.trial.term.law.part for found in state.found)
 
 
+def _out_of_order(state: Investigation) -> int:
+    """Number of masses and instruments that are off beyond their tolerances."""
+    return len(faulty(state)) if state.calibrations else 0
+
+
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
     """Whether so many changes were found that they imitate another structure than the file's.
 
@@ -130,7 +135,7 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
     rules, parts = state.options.rules.verdict, changed_parts(state)
     if errors is None or parts > rules.parts:
         return parts > rules.parts
-    off = len(faulty(state)) if state.calibrations else 0
+    off = _out_of_order(state)
     share = errors.explained(rules)
     left = bool(np.any(errors.unexplained(rules) > 0)) and share is not None and share < 1 - rules.parts_leave
     return 2 * off > (state.calibrations or 1) or (left and (parts > 1 or parts + off > rules.parts))

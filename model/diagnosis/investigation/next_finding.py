@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
-from sprung.model.diagnosis.fit.misfit import misfit
+from sprung.model.diagnosis.fit.misfit import is_gross
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.calibration import (
     calibrated,
@@ -116,8 +116,7 @@ def _with_leading(state: Investigation, competition: _Competition, progress: Cal
 def _candidates(state: Investigation) -> list[Candidate]:
     """The candidates of the last screening that are worth a fit."""
     options, rules = state.options, state.options.rules
-    error = float(np.sqrt(np.mean(misfit(state.fit))))
-    gross = not state.problem.process_noise and error > rules.selection.gross
+    gross = is_gross(state.problem, state.fit)
     screening = without_calibrations(state)
     # what is not sought sets no scale for the others
     screening = replace(screening, candidates=tuple(sought(state, screening.candidates)))
@@ -193,10 +192,9 @@ def _refitted(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple
     """The model with the chosen law and noise levels estimated anew, and the variant of the law that fits best then."""
     fit = chosen.fit if chosen.named else _with_surface(state, chosen.fit)
     problem, fit = refreshed(state.problem, with_free_gains(state, fit))
-    gross = not problem.process_noise and float(np.sqrt(np.mean(misfit(state.fit)))) > problem.rules.selection.gross
-    if gross:
-        fit = sharpened(problem, fit)
-        problem, fit = refreshed(problem, fit)
+    sharp = sharpened(problem, fit) if is_gross(problem, state.fit) else fit
+    if sharp is not fit:
+        problem, fit = refreshed(problem, sharp)
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
     if not fit.converged and not problem.process_noise:

@@ -14,17 +14,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation
-from sprung.model.diagnosis.record.spectra import OVERSAMPLING
+from sprung.model.diagnosis.investigation.widened import with_model
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
-from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, cost
 from sprung.model.diagnosis.selection.evidence import profile_gain
-from sprung.model.laws import ElementLaw, SpringDamper, observe
+from sprung.model.diagnosis.selection.starts import seen
+from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.along import force_along
 from sprung.model.laws.base import Restatement
 
@@ -82,9 +81,8 @@ def _started(base: Fit, index: int, other: Restatement, theta: np.ndarray) -> Po
     terms, term = base.point.terms, base.point.terms[index]
     port, grid = term.port(base.forward.system), base.forward.part.grid
     d, v = (motion @ port for motion in base.element_motion)
-    thin = slice(None, None, OVERSAMPLING)
-    seen = observe(d[thin], v[thin], 1 / grid.step, other.element.stiffness, other.element.damping)
-    scales = tuple(max(abs(spec.typical(seen)), 1e-12) for spec in other.law.parameters)
+    motion = seen(base, term, other.element)
+    scales = tuple(max(abs(spec.typical(motion)), 1e-12) for spec in other.law.parameters)
     told = Term(other.law, term.location, other.parameters, scales=scales)
     near = list(base.point.warm_start)
     place = sum(evaluated_in_time(one) for one in terms[:index])
@@ -125,14 +123,11 @@ def _as_trial(state: Investigation, found: AcceptedFinding, name: str) -> Trial 
 def _adopted(state: Investigation, told: Fit, index: int, trial: Trial) -> Investigation:
     """The investigation with one of its findings in other words."""
     found = state.found[index]
-    problem, fit = refreshed(state.problem, told)
     runner_up = found.runner_up
     if runner_up is not None and runner_up.term.law.name == trial.term.law.name:
         runner_up = found.trial
     found = replace(found, trial=trial, trials=(*_others(found, trial), found.trial), runner_up=runner_up)
-    last = screen(problem, fit, problem.system.catalogue, state.options.project)
-    state = replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise), last=last)
-    return _with_finding(state, index, found)
+    return _with_finding(with_model(state, told), index, found)
 
 
 def _others(found: AcceptedFinding, trial: Trial) -> tuple[Trial, ...]:

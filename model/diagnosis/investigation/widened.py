@@ -85,7 +85,12 @@ def rivals_of_wider(state: Investigation, wide: WidenedFit) -> list[Candidate]:
 
 def adopt_wider(state: Investigation, wide: WidenedFit) -> Investigation:
     """The investigation with a law that was found in its wider form."""
-    problem, fit = refreshed(state.problem, wide.fit)
+    return with_model(state, wide.fit)
+
+
+def with_model(state: Investigation, fit: Fit) -> Investigation:
+    """The investigation with another fit as its model, noise levels estimated and the residual screened anew."""
+    problem, fit = refreshed(state.problem, fit)
     last = screen(problem, fit, state.problem.system.catalogue, state.options.project)
     return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise), last=last)
 

@@ -18,7 +18,6 @@ from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.starts import joint_start, seen, wider_starts
-from sprung.model.laws import ElementLaw
 from sprung.model.schema import ForceInput
 from sprung.model.system import System
 
@@ -101,7 +100,7 @@ def sharpened(problem: Problem, fit: Fit) -> Fit:
     Simulations along sharp corners have many local optima; the fit of the lowest chi-square is returned.
     """
     term = fit.point.terms[-1]
-    if not isinstance(term.law, ElementLaw) or term.law.corner is None:
+    if term.law.corner is None:
         return fit
     measured = MeasuredMotion.of(problem, fit)
     along = None if measured is None else measured.fitted(_with_corner(measured.fit, term, _SHARP))
@@ -123,7 +122,7 @@ def _blunt(fit: Fit, point: Point) -> Point:
     Simulations along sharp corners are rough functions of all values, whose steps mislead.
     """
     term = point.terms[-1]
-    if not isinstance(term.law, ElementLaw) or term.law.corner is None:
+    if term.law.corner is None:
         return point
     wide, corner = _with_corner(fit, term, _BLUNT).terms[-1], term.law.corner
     return point if wide.parameters[corner] < term.parameters[corner] else _ending(point, wide)
@@ -131,7 +130,7 @@ def _blunt(fit: Fit, point: Point) -> Point:
 
 def _with_corner(fit: Fit, term: Term, share: float) -> Point:
     """The point of a fit with its last term exchanged for one whose corner is a share of the rms rate wide."""
-    values, corner = np.array(term.parameters), term.element_law.corner
+    values, corner = np.array(term.parameters), term.law.corner
     assert corner is not None, f"{term.law.name} has no corner"
     values[corner] = share * seen(fit, term).rate_rms
     return _ending(fit.point, term.at(values))

@@ -12,7 +12,7 @@ import numpy as np
 
 from sprung.model.chunks import WORKERS, Piece, Result, share
 from sprung.model.diagnosis.fit.baseline import refreshed
-from sprung.model.diagnosis.fit.misfit import misfit
+from sprung.model.diagnosis.fit.misfit import is_gross
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
@@ -135,8 +135,7 @@ def _initial_fits(problem: Problem, base: Fit, candidates: list[Candidate]) -> l
     screened = problem.rules.screening
     most = max((candidate.strength(screened) for candidate in candidates), default=0.0)
     again = problem.rules.selection.again * most
-    gross = float(np.sqrt(np.mean(misfit(base)))) > problem.rules.selection.gross
-    measured = MeasuredMotion.of(problem, base) if gross else None
+    measured = MeasuredMotion.of(problem, base) if is_gross(problem, base) else None
 
     def initial_fit(own: Problem, candidate: Candidate) -> Trial | None:
         return _initial_fit(own, base, candidate, candidate.strength(screened) > again, measured)
@@ -226,7 +225,7 @@ def _initial_fit(
     starts = starts_of(problem, base, candidate)
     tried = [t for t in (_try(problem, base, candidate, start, 3) for start in starts) if t is not None]
     along = [] if measured is None else measured.starts(candidate)
-    steps = _STEPS if getattr(candidate.term.law, "corner", None) is None else SHARPENED
+    steps = _STEPS if candidate.term.law.corner is None else SHARPENED
     tried += [t for t in (_try(exact, base, candidate, start, steps) for start in along) if t is not None]
     best = max(tried, key=lambda t: t.evidence, default=None)
     if again and (best is None or _leaves_much(problem, best)):

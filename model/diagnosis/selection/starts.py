@@ -15,7 +15,7 @@ from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point, advance, fixed
 from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.laws import ElementLaw, Observed, StructureLaw, observe
+from sprung.model.laws import ElementLaw, Observed, SpringDamper, StructureLaw, observe
 from sprung.model.laws.base import FittedElement, Restart
 
 
@@ -186,9 +186,9 @@ def wider_starts(base: Fit, index: int) -> Iterator[Point]:
         yield replace(base.point, terms=terms)
 
 
-def seen(base: Fit, term: Term) -> Observed:
-    """The motion of a term's element."""
+def seen(base: Fit, term: Term, element: SpringDamper | None = None) -> Observed:
+    """The motion of a term's element; beside the spring and damper of the fit, or others."""
     port, thin = term.port(base.forward.system), slice(None, None, OVERSAMPLING)
     d, v = (motion[thin] @ port for motion in base.element_motion)
-    element = base.forward.element_of(term)
+    element = base.forward.element_of(term) if element is None else element
     return observe(d, v, 1 / base.forward.part.grid.step, float(element.stiffness), float(element.damping))
