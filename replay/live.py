@@ -30,7 +30,9 @@ CAUGHT_UP_SECONDS = 0.5  # ... the reader is this close again
 CLOCK_STEP_SECONDS = 120.0  # a longer delay than this is a clock that was set, not a queue
 ASK_SECONDS = 5.0  # between two looks at the kernel's counters
 ERROR_BUS_OFF, ERROR_RESTARTED = 0x40, 0x100  # classes of error frames, as linux/can/error.h names them
+NO_FRAME = "datagram is no frame"
 BUS_OFF = "the controller is bus-off; give `ip link set` a `restart-ms` for it to come back by itself"
+DATAGRAMS = ("udp_multicast",)  # interfaces on which whoever is on the network may send anything, a datagram at a time
 OFFSET_DRIFT = 1e-3  # by which the clock of an interface may drift against the host's
 
 
@@ -122,20 +124,36 @@ class LiveBus:
         """Frames collected during one latency.  Errors: those of the bus."""
         while not self.stop.is_set():
             self.beat = time.monotonic()
-            message = bus.recv(timeout=self._latency)
+            message = self._next(bus, self._latency)
             if message is None:
                 continue
             messages = [message]
             end = time.monotonic() + self._latency
             try:
                 while (left := end - time.monotonic()) > 0 and len(messages) < MOST_FRAMES:
-                    message = bus.recv(timeout=left)
+                    message = self._next(bus, left)
                     if message is not None:
                         messages.append(message)
             except BUS_ERRORS:
                 yield messages  # frames received before the bus was lost
                 raise
             yield messages
+
+    def _next(self, bus: can.BusABC, timeout: float) -> can.Message | None:
+        """The next frame; None where none came in time, or what came is none.  Errors: those of the bus."""
+        if self.address.interface not in DATAGRAMS:
+            return bus.recv(timeout=timeout)
+        try:
+            message = bus.recv(timeout=timeout)
+        except can.CanError as error:
+            if isinstance(error.__cause__, OSError | None):
+                raise
+            self.account.corrupt(1, NO_FRAME)  # it costs itself, not the bus
+            return None
+        if message is not None and type(message.arbitration_id) is not int:  # nor does python-can look at types
+            self.account.corrupt(1, NO_FRAME)
+            return None
+        return message
 
     def _opened(self, bus: can.BusABC) -> None:
         self.connected, self.trouble = True, ""

@@ -70,7 +70,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         core = build_core(settings, engine, following)
         stack.callback(core.close)
         notice = access_notice(settings, core.tokens.any or core.oidc is not None)
-        core.feeds = [live_feed(core, text, feeds.vehicle) for text in feeds.buses]
+        core.feeds += [live_feed(core, text, feeds.vehicle) for text in feeds.buses]  # notices look at this list
         files = threading.Thread(target=_feed_files, args=(core, feeds, watch), daemon=True)
 
         def start() -> None:

@@ -7,6 +7,7 @@ the groups that the provider names: the settings say which group gives which sco
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import hashlib
 import http.client
@@ -24,6 +25,8 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode, urlsplit
 
+from sprung.model.text import escaped
+from sprung.service.access import outside
 from sprung.service.access.tokens import SCOPES, Actor, Refused
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
@@ -37,6 +40,7 @@ AGAIN_SECONDS = 30.0  # before keys are asked for again because of a token with 
 BEGUN_SECONDS = 600.0  # that signing in may take
 MOST_BEGUN = 1000
 LEEWAY = 60.0  # s, between the clocks
+MOST_ASKING = 4  # requests that may wait for the provider: there are 40 threads for everything
 CALLBACK = "/signin/oidc/callback"
 FLEET = "fleet:"
 
@@ -85,6 +89,7 @@ class Provider:
         self._keys: tuple[float, Any] = (-1e9, None)
         self._away: tuple[float, str] = (-1e9, "")  # when and how the provider failed last
         self._lock = threading.Lock()
+        self.asking = asyncio.Semaphore(MOST_ASKING)  # to be held by whoever calls from an event loop
 
     def begin(self, callback: str, to: str) -> tuple[str, str]:
         """Where to send a browser, and the state that it must bring back.  Raises Unreachable."""
@@ -140,6 +145,7 @@ class Provider:
         groups = [found] if isinstance(found, str) else found if isinstance(found, list) else []
         held = [grant for group, grant in self._grants.items() if group in groups]
         name = str(claims.get("preferred_username") or claims.get("email") or claims["sub"])[:120]
+        name = escaped(name)  # often of the person's own choice, and read in the audit log
         if not held:
             raise Refused(f"{name} is in no group that may do anything here")
         # scopes of one fleet never count for another: the first group in the settings decides which fleet it is
@@ -258,7 +264,46 @@ class _NoRedirect(urllib.request.HTTPRedirectHandler):
         return None
 
 
-_open: Callable[..., Any] = urllib.request.build_opener(_NoRedirect).open
+class _Timed(http.client.HTTPConnection):
+    """Ended when its answer's header takes long in all: the time-out of a socket begins anew with every byte."""
+
+    _ended: threading.Timer | None = None
+
+    def connect(self) -> None:
+        super().connect()
+        self._ended = outside.hung_up_after(self.sock, SECONDS)
+
+    def close(self) -> None:
+        if self._ended is not None:
+            self._ended.cancel()
+        super().close()
+
+
+class _TimedTls(_Timed, http.client.HTTPSConnection):
+    pass
+
+
+class _Plain(urllib.request.HTTPHandler):
+    def http_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(_Timed, req)
+
+
+class _Secure(urllib.request.HTTPSHandler):
+    def https_open(self, req: urllib.request.Request) -> http.client.HTTPResponse:
+        return self.do_open(_TimedTls, req)
+
+
+_open: Callable[..., Any] = urllib.request.build_opener(_NoRedirect, _Plain, _Secure).open
+
+
+def _content(answer: Any) -> bytes:
+    """As much of an answer as comes in time.  Raises TimeoutError."""
+    ends, found = time.monotonic() + SECONDS, bytearray()
+    while len(found) < MOST_BYTES and (piece := answer.read1(MOST_BYTES)):
+        found += piece
+        if time.monotonic() > ends:
+            raise TimeoutError
+    return bytes(found)
 
 
 def _fetch(url: str, form: bytes | None = None) -> dict[str, Any]:
@@ -266,14 +311,14 @@ def _fetch(url: str, form: bytes | None = None) -> dict[str, Any]:
     host = urlsplit(url).netloc
     try:
         with _open(urllib.request.Request(url, form, {"Accept": "application/json"}), timeout=SECONDS) as answer:
-            found = json.loads(answer.read(MOST_BYTES))
+            found = json.loads(_content(answer))
     except urllib.error.HTTPError as error:
         error.close()
         if form is not None and error.code in (400, 401, 403):
             log.warning("%s refused a sign-in: %d", host, error.code)
             raise Refused("the provider refused the sign-in; begin again") from None
         raise Unreachable(f"{host} answered {error.code}") from None
-    except (OSError, ValueError, http.client.HTTPException) as error:
+    except (OSError, ValueError, RuntimeError, http.client.HTTPException) as error:  # JSON too deep; no thread
         raise Unreachable(f"{host} does not answer as a provider should: {type(error).__name__}") from None
     if not isinstance(found, dict):
         raise Unreachable(f"{host} does not answer as a provider should")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import http.client
 import ipaddress
+import os
 import socket
 import ssl
 import threading
@@ -22,6 +23,9 @@ Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 LONGEST = 300
 NAT64 = ipaddress.ip_network("64:ff9b::/96")
+# of IANA's special-purpose registries, what versions of Python before 3.11.10 take for public: among it the addresses
+# at which clouds tell a machine its secrets.  168.63.129.16 is Azure's, an ordinary address that its hosts answer.
+INNER = tuple(map(ipaddress.ip_network, ("192.0.0.0/24", "168.63.129.16", "fec0::/10", "5f00::/16", "3fff::/20")))
 SETTING = "SPRUNG_WEBHOOK_NETWORKS"
 
 
@@ -78,7 +82,7 @@ def judged(address: Address, allowed: Sequence[Network]) -> str | None:
         kind = "a link-local address, where clouds keep their secrets"
     elif plain.is_multicast or plain.is_unspecified or plain.is_reserved:
         kind = "no address of a single host"
-    elif not plain.is_global:
+    elif not plain.is_global or any(plain in network for network in INNER if network.version == plain.version):
         kind = "a private address"
     else:
         return None
@@ -128,19 +132,34 @@ def post(url: str, body: bytes, headers: dict[str, str], allowed: Sequence[Netwo
 @contextmanager
 def _within(line: socket.socket, seconds: float) -> Iterator[None]:
     """Close connections that take longer in total: the time-out of a socket restarts with every byte."""
-    with closing(line.dup()) as same:  # TLS takes the other one over
-        ended = threading.Timer(seconds, _hang_up, [same])
-        ended.daemon = True
+    ended = hung_up_after(line, seconds)
+    try:
+        yield
+    finally:
+        ended.cancel()
+
+
+def hung_up_after(line: socket.socket, seconds: float) -> threading.Timer:
+    """A timer, running, that ends a connection; its descriptor may be taken over by TLS, or closed, meanwhile."""
+    same = socket.socket(fileno=os.dup(line.fileno()))
+
+    def hang_up() -> None:
+        with suppress(OSError):
+            same.shutdown(socket.SHUT_RDWR)
+
+    class Timer(threading.Timer):
+        def run(self) -> None:
+            with closing(same):
+                super().run()
+
+    ended = Timer(seconds, hang_up)
+    ended.daemon = True
+    try:
         ended.start()
-        try:
-            yield
-        finally:
-            ended.cancel()
-
-
-def _hang_up(line: socket.socket) -> None:
-    with suppress(OSError):
-        line.shutdown(socket.SHUT_RDWR)
+    except RuntimeError:  # no thread for it
+        same.close()
+        raise
+    return ended
 
 
 def _spoken(receiver: Receiver, line: socket.socket) -> http.client.HTTPConnection:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import ipaddress
 import logging
 import math
@@ -37,7 +36,6 @@ METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 UNSAFE = ("POST", "PUT", "PATCH", "DELETE")
 BURST_SECONDS = 2.0  # of the permitted rate that may come at once
 MOST_CLIENTS = 10_000
-MOST_ASKING = 4  # requests that may wait for the OpenID Connect provider: there are 40 threads for everything
 MOST_HEADERS, MOST_HEADER_BYTES = 100, 32_000  # of one request: browsers send twenty, and cookies of 4 kB at most
 
 LOCAL, NOBODY = Actor(), Actor("nobody", frozenset())
@@ -85,7 +83,6 @@ class Guard:
         self._tokens = tokens
         self._limiter = Limiter(settings.client_requests_per_second)
         self._good: OrderedDict[str, bool] = OrderedDict()  # digests of tokens and sessions that were good lately
-        self._asking = asyncio.Semaphore(MOST_ASKING)
         self._local = is_loopback(settings.host)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -191,7 +188,7 @@ class Guard:
         if self._oidc is None or kind.lower() != "bearer" or not looks_like_jwt(text.strip()):
             return None
         try:
-            async with self._asking:
+            async with self._oidc.asking:
                 return await run_in_threadpool(self._oidc.actor, text.strip()), False
         except Refused as refused:
             raise _unauthorized(str(refused)) from None

@@ -58,7 +58,8 @@ async def sign_in_elsewhere(
     provider = _provider(core)
     callback = f"{core.settings.public_url.rstrip('/') or str(request.base_url).rstrip('/')}{CALLBACK}"
     try:
-        place, state = await run_in_threadpool(provider.begin, callback, _inside(to))
+        async with provider.asking:
+            place, state = await run_in_threadpool(provider.begin, callback, _inside(to))
     except Unreachable as error:
         return _unreachable(core, _inside(to), error)
     response = RedirectResponse(place, 303)
@@ -79,7 +80,8 @@ async def signed_in_elsewhere(request: Request, core: CoreOf) -> Response:
             raise Refused("signing in was not begun in this browser; begin again")
         if "error" in sent or not code:
             raise Refused(f"the provider refused the sign-in: {sent.get('error', 'no code')[:200]}")
-        actor, to = await run_in_threadpool(provider.finish, state, code)
+        async with provider.asking:
+            actor, to = await run_in_threadpool(provider.finish, state, code)
     except Refused as refused:
         return _form(core, "/", str(refused), 401)
     except Unreachable as failed:

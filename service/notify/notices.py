@@ -5,17 +5,15 @@ An attempt that fails is made again after 5 s, 30 s, 2 min, ... for about two da
 
 from __future__ import annotations
 
-import http.client
 import ipaddress
 import logging
-import smtplib
 import threading
+import time
 import uuid
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from sqlalchemy import Connection
-from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.access import outside
 from sprung.service.errors import UserError
@@ -33,7 +31,8 @@ PAUSES = (5, 30, 120, 600, 1800, 3600, 10_800, 21_600, 43_200, 86_400)  # s befo
 KEPT_DAYS = 30
 PERIOD_SECONDS = 2.0
 FORGET_SECONDS = 3600
-AT_ONCE = 50
+AT_ONCE = 50  # deliveries to one receiver before it is the next one's turn
+TURN_SECONDS = 2.0  # after which a receiver's turn ends with the attempt that is being made
 
 
 class Notices:
@@ -46,6 +45,7 @@ class Notices:
         self._feeds = feeds
         self._working: dict[str, bool] = {}
         self._targets = receivers(settings)
+        senders.signing_key(settings.webhook_secret)  # wrong ones are told now
         self._allowed = outside.networks(settings.webhook_networks)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sprung-notify", daemon=True)
@@ -75,23 +75,28 @@ class Notices:
     def watch_feeds(self) -> None:
         """Tell of live buses that were lost or found since the last call."""
         for feed in self._feeds():
-            before = self._working.get(feed.name, True)
-            self._working[feed.name] = feed.works
-            if before != feed.works:
+            if self._working.get(feed.name, True) != feed.works:
                 base = self._settings.public_url
                 event = events.feed_event(base, feed.name, feed.vehicle, feed.works, feed.detail, now_ns())
                 with self._store.write() as connection:
                     self._accept(connection, event)
+            self._working[feed.name] = feed.works  # not before it is written down
 
     def deliver(self, now: int) -> int:
-        """Try what is due, as if it were `now`; how many arrived."""
+        """Try what is due, as if it were `now`; how many arrived.
+
+        Receivers take turns: one that takes ten seconds to fail holds the others up once, and not with everything that
+        waits for it.
+        """
         with self._store.read() as connection:
-            waiting = outbox.due(connection, now, AT_ONCE)
+            waiting = {target: outbox.due(connection, now, target, AT_ONCE) for target in outbox.targets(connection)}
         arrived = 0
-        for row in waiting:
-            if self._stopping.is_set():
-                break
-            arrived += self._attempt(row, now)
+        for rows in waiting.values():
+            begun = time.monotonic()
+            for row in rows:
+                if self._stopping.is_set() or time.monotonic() - begun > TURN_SECONDS:
+                    break
+                arrived += self._attempt(row, now)
         return arrived
 
     def _attempt(self, row: DeliveryRow, now: int) -> bool:
@@ -101,7 +106,7 @@ class Notices:
             else:
                 senders.post(row.target, row.event, self._settings.webhook_secret, self._allowed)
             values: dict[str, Any] = {"state": "delivered", "error": None}
-        except (OSError, ValueError, smtplib.SMTPException, http.client.HTTPException) as error:
+        except Exception as error:  # whatever it is: others wait behind it
             line = " ".join(str(error).split())[:300] or type(error).__name__
             dead = row.attempts >= len(PAUSES)
             pause = PAUSES[min(row.attempts, len(PAUSES) - 1)]
@@ -128,7 +133,7 @@ class Notices:
                     forgotten = now_ns()
                     with self._store.write() as connection:
                         outbox.forget_deliveries(connection, forgotten - KEPT_DAYS * 86_400 * NANOSECONDS)
-            except SQLAlchemyError:
+            except Exception:  # the store, or no thread for a time-out: nothing else would send what waits
                 log.exception("notifications could not be sent; they are tried again")
 
 

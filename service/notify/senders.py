@@ -14,11 +14,13 @@ from email.message import EmailMessage
 from typing import Any
 
 from sprung.service.access import outside
+from sprung.service.errors import UserError
 from sprung.service.notify.events import sentence
 from sprung.service.settings import Settings
 
 SECONDS = 10.0
 SUCCESS = range(200, 300)
+ENCODED = "whsec_"  # begins a secret in base64
 
 
 def post(url: str, event: dict[str, Any], secret: str | None, allowed: Sequence[outside.Network] = ()) -> None:
@@ -42,10 +44,21 @@ def signature(identity: str, seconds: int, body: bytes, secret: str | None) -> d
     """
     headers = {"webhook-id": identity, "webhook-timestamp": str(seconds)}
     if secret:
-        key = base64.b64decode(secret.removeprefix("whsec_")) if secret.startswith("whsec_") else secret.encode()
-        digest = hmac.new(key, f"{identity}.{seconds}.".encode() + body, hashlib.sha256).digest()
+        digest = hmac.new(signing_key(secret), f"{identity}.{seconds}.".encode() + body, hashlib.sha256).digest()
         headers["webhook-signature"] = f"v1,{base64.b64encode(digest).decode()}"
     return headers
+
+
+def signing_key(secret: str | None) -> bytes:
+    """The bytes that a secret stands for.  Raises UserError where it begins as one in base64 and is none."""
+    if secret is None or not secret.startswith(ENCODED):
+        return (secret or "").encode()
+    try:
+        return base64.b64decode(secret.removeprefix(ENCODED), validate=True)
+    except ValueError:
+        raise UserError(
+            f"setting webhook_secret (SPRUNG_WEBHOOK_SECRET): what follows {ENCODED} is no base64"
+        ) from None
 
 
 def mail(settings: Settings, address: str, event: dict[str, Any]) -> None:

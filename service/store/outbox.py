@@ -31,10 +31,17 @@ def add_delivery(connection: Connection, row: DeliveryRow) -> None:
     connection.execute(insert(deliveries).values(**{name: getattr(row, name) for name in DeliveryRow.__slots__}))
 
 
-def due(connection: Connection, now: int, limit: int) -> list[DeliveryRow]:
-    """Those to be tried now, the longest waiting first."""
+def targets(connection: Connection) -> list[str]:
+    """Receivers that something waits for."""
+    query = select(deliveries.c.target).where(deliveries.c.state == "waiting").distinct()
+    return list(connection.execute(query.order_by(deliveries.c.target)).scalars())
+
+
+def due(connection: Connection, now: int, target: str, limit: int) -> list[DeliveryRow]:
+    """Those of a receiver to be tried now, the longest waiting first."""
     table = deliveries
-    query = select(table).where(table.c.state == "waiting", table.c.next_ns <= now).order_by(table.c.next_ns)
+    mine = (table.c.state == "waiting", table.c.target == target, table.c.next_ns <= now)
+    query = select(table).where(*mine).order_by(table.c.next_ns, table.c.created_ns)
     return [DeliveryRow(*row) for row in connection.execute(query.limit(limit))]
 
 

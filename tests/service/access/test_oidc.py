@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import base64
+import http.client
 import json
+import socket
+import threading
+import time
 from collections.abc import Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -12,7 +17,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from fastapi.testclient import TestClient
 
-from sprung.service.access.oidc import Provider
+from sprung.service.access.oidc import Provider, Unreachable
 from sprung.service.access.tokens import Refused
 from sprung.service.api.guard import COOKIE
 from sprung.service.api.signin import STATE_COOKIE
@@ -23,6 +28,7 @@ from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 from sprung.service.store import audit
 from tests.oidc_provider import KEY, STRANGER, FakeProvider, jwt, provider_settings, running_provider
+from tests.served import served
 
 
 @pytest.fixture
@@ -182,6 +188,65 @@ def test_a_provider_that_is_back_is_asked_again(
     assert client.get("/vehicles", headers=headers).status_code == 503
     monkeypatch.setattr("sprung.service.access.oidc.AGAIN_SECONDS", 0.0)
     assert client.get("/vehicles", headers=headers).status_code == 200
+
+
+def test_sign_ins_that_wait_for_a_provider_hold_up_nobody_else(
+    engine: Engine, tmp_path: Path, provider: FakeProvider
+) -> None:
+    """It takes connections and never answers; more people sign in than the service has threads."""
+    with socket.create_server(("127.0.0.1", 0), backlog=200) as silent:
+        provider.issuer = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        core = build_core(provider_settings(provider, tmp_path), engine)
+        token = core.tokens.create("t", ["read"])[0]
+        with served(core) as port:
+
+            def status(path: str, **headers: str) -> int:
+                with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+                    connection.request("GET", path, headers=headers)
+                    return connection.getresponse().status
+
+            people = [threading.Thread(target=status, args=("/signin/oidc",), daemon=True) for _ in range(80)]
+            for one in people:
+                one.start()
+            time.sleep(0.5)
+            begun = time.monotonic()
+            assert status("/vehicles", authorization=f"Bearer {token}") == 200
+            assert time.monotonic() - begun < 3.0  # the provider's five seconds are not over
+            for one in people:
+                one.join()
+
+
+@pytest.mark.parametrize("begins", [b"HTTP/1.1 200 OK\r\nX: ", b"HTTP/1.1 200 OK\r\nContent-Length: 9999\r\n\r\n{"])
+def test_a_provider_that_drips_is_hung_up_on(
+    provider: FakeProvider, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begins: bytes
+) -> None:
+    """Each byte comes in time, of the header or of the body; all of them together do not."""
+    monkeypatch.setattr("sprung.service.access.oidc.SECONDS", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def drip() -> None:
+            line, _ = listening.accept()
+            with line, suppress(OSError):
+                line.recv(65536)
+                line.sendall(begins)
+                for _ in range(100):
+                    line.sendall(b" ")
+                    time.sleep(0.1)
+
+        dripping = threading.Thread(target=drip, daemon=True)
+        dripping.start()
+        provider.issuer = f"http://127.0.0.1:{listening.getsockname()[1]}"
+        begun = time.monotonic()
+        with pytest.raises(Unreachable):
+            Provider(provider_settings(provider, tmp_path)).begin("http://x/", "/")
+        assert time.monotonic() - begun < 5.0
+        dripping.join()
+
+
+def test_names_that_people_choose_cannot_deceive(provider: FakeProvider, tmp_path: Path) -> None:
+    taken = Provider(provider_settings(provider, tmp_path))
+    name = taken.actor(provider.token(preferred_username="anna\x1b[31m\u202e\n2026 admin")).name
+    assert name == r"oidc:anna\x1b[31m\u202e\n2026 admin"
 
 
 @pytest.mark.parametrize(
