@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import gc
 import logging
+import shutil
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from sprung.replay.bounds import check_whole, mdf_sizes
 from sprung.replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
 from sprung.replay.plausibility import EARLIEST, LATEST, OUT_OF_TIME
 
+UNFINISHED = 60  # offset of the flags that say what a logger left undone, two and two bytes
+COPIED_AT_ONCE = 1 << 20
 SIGNATURES = (b"MDF", b"UnFinMF")  # the second of a logger that was not stopped
 
 
@@ -28,14 +32,15 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
     except ImportError:
         raise UnreadableRecording(f"{path}: reading MF4 needs asammdf; install sprung[mf4]") from None
     with path.open("rb") as file:
-        head = file.read(16)
+        head = file.read(64)
     if head[:8].strip() not in SIGNATURES:
         raise UnreadableRecording(f"{path}: not an MDF file: {'it does not begin as one' if head else 'it is empty'}")
     check_whole(path, mdf_sizes(path))
+    unfinished = bool(int.from_bytes(head[UNFINISHED : UNFINISHED + 4], "little"))
     with _quietly():
         wrong = ""
         try:
-            with MDF(path) as mdf:
+            with _opened(path, unfinished) as file, MDF(file) as mdf:
                 start = round(mdf.header.start_time.timestamp() * 1e6) * 1_000
                 groups = list(_groups(mdf, account))
                 mdf_version = mdf.version
@@ -44,7 +49,7 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         if wrong:
             gc.collect()  # incomplete objects warn when collected: do it here, with warnings off
     if wrong:
-        version = head[8:].decode("ascii", "replace").strip(" \0") or "?"
+        version = head[8:16].decode("ascii", "replace").strip(" \0") or "?"
         raise UnreadableRecording(
             f"{path}: an MDF file of version {version} that cannot be read: damaged, cut short, or of a kind that "
             f"asammdf does not know ({wrong})"
@@ -78,10 +83,29 @@ def _absolute(seconds: FloatArray, start: int) -> tuple[IntArray, BoolArray]:
 
 
 @contextmanager
+def _opened(path: Path, unfinished: bool) -> Iterator[Path | IO[bytes]]:
+    """What asammdf reads: the file, or, of one that a logger did not finish and that asammdf completes, a copy.
+
+    asammdf's own copy stays for ever when the file turns out to be damaged, or the process is killed; this one has no
+    name and goes with the process.
+    """
+    if not unfinished:
+        yield path
+        return
+    with tempfile.TemporaryFile() as copy:
+        with path.open("rb") as file:
+            shutil.copyfileobj(file, copy, COPIED_AT_ONCE)
+        yield copy
+
+
+@contextmanager
 def _quietly() -> Iterator[None]:
-    """asammdf's objects print tracebacks when they end before they were whole; its log is for its authors."""
+    """asammdf prints tracebacks where it fails, and its objects when they end before they were whole; its log is for
+    its authors."""
     hook, log = sys.unraisablehook, logging.getLogger("asammdf")
     level = log.level
+    for name in ("mdf_v3", "mdf_v4"):
+        vars(sys.modules[f"asammdf.blocks.{name}"])["print"] = _unsaid  # of these modules alone
     sys.unraisablehook = lambda unraisable: None if _of_asammdf(unraisable.object) else hook(unraisable)
     log.setLevel(logging.CRITICAL + 1)
     try:
@@ -89,6 +113,10 @@ def _quietly() -> Iterator[None]:
     finally:
         sys.unraisablehook = hook
         log.setLevel(level)
+
+
+def _unsaid(*_: object, **__: object) -> None:
+    """In place of `print`."""
 
 
 def _of_asammdf(thing: Any) -> bool:

@@ -173,3 +173,25 @@ def test_a_file_that_is_no_mdf_is_reported_in_plain_words(content: bytes, told: 
     with pytest.raises(UnreadableRecording) as refused:
         list(mf4.frames(path, Account()))
     assert told in str(refused.value) and "mmap" not in str(refused.value) and "magic" not in str(refused.value)
+
+
+@pytest.mark.parametrize("undone", [1, 4, 5, 60])  # what the logger left: counters, the last length, both, more
+def test_an_unfinished_mdf_file_leaves_no_copy_and_prints_nothing(
+    undone: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """asammdf completes a copy beside other temporary files, and leaves it there where it fails."""
+    pytest.importorskip("asammdf")
+    path, folder = tmp_path / "a.mf4", tmp_path / "temporary"
+    write_can(path)
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    content = bytearray(path.read_bytes())
+    content[:8], content[60:62] = b"UnFinMF ", undone.to_bytes(2, "little")
+    path.write_bytes(content)
+    try:
+        list(mf4.frames(path, Account()))
+    except UnreadableRecording as error:
+        assert "cannot be read" in str(error)
+    assert path.read_bytes() == content
+    assert list(folder.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
