@@ -48,7 +48,7 @@ def columns(path: Path) -> list[Column]:
             for column in _of_segment(segment, point, shape):
                 number = seen[column.name] = seen[column.name] + 1
                 found.append(column if number == 1 else replace(column, name=f"{column.name} #{number}"))
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise UnreadableRecording(f"{path}: a damaged segment: {error}") from error
     if not found:
         raise UnreadableRecording(f"{path}: no segment of numbers in it")

@@ -40,7 +40,7 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
     with _quietly():
         wrong = ""
         try:
-            with _opened(path, unfinished) as file, MDF(file) as mdf:
+            with _opened(path, unfinished) as source, MDF(source) as mdf:
                 start = round(mdf.header.start_time.timestamp() * 1e6) * 1_000
                 groups = list(_groups(mdf, account))
                 mdf_version = mdf.version

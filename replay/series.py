@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import datetime
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -66,14 +67,6 @@ def _json(path: Path) -> Iterator[list[Column]]:
     yield list(_flat(content if isinstance(content, Mapping) else {"data": content}))
 
 
-def _as_float(value: Any) -> float:
-    """NaN for missing values, and for integers beyond the range of floats."""
-    try:
-        return np.nan if value is None else float(value)
-    except OverflowError:
-        return np.nan
-
-
 def _flat(content: Any, name: str = "", depth: int = 0) -> Iterator[Column]:
     """Every series in nested structures: `rig.force`; columns of matrices as `data(:,2)`."""
     if isinstance(content, Mapping):
@@ -83,19 +76,17 @@ def _flat(content: Any, name: str = "", depth: int = 0) -> Iterator[Column]:
         return
     try:
         values = np.asarray(content)
-    except ValueError:  # rows of different lengths
+    except ValueError:  # rows of different lengths, or something else among numbers
+        values = np.empty(len(content), dtype=object)
+        values[:] = content
+    if values.dtype.kind == "O" and not any(isinstance(value, int | float) for value in values.ravel()):
         return
-    if values.dtype.kind == "O":
-        try:
-            values = np.array([_as_float(value) for value in values.ravel()]).reshape(values.shape)
-        except (TypeError, ValueError):
-            return
     yield from of_array(name, values)
 
 
 def of_array(name: str, values: NDArray[Any]) -> Iterator[Column]:
     """The series of an array of numbers, along its longest axis."""
-    if values.dtype.kind in "fiubUM":
+    if values.dtype.kind in "fiubUMO":
         for suffix, sheet, at in _series_in(values.shape):
             yield replace(whole(name + suffix, values[at(slice(None))], None), sheet=sheet)
 
@@ -213,7 +204,8 @@ def _tdms(path: Path) -> Iterator[list[Column]]:
                     continue
                 unit = said.get("unit_string") or said.get("Unit") or said.get("NI_UnitDescription")
                 name = f"{group.name}/{channel.name}"
-                columns.append(Column(name, len(channel), _reader(channel), unit or None, _waveform(said)))
+                unit = unit if isinstance(unit, str) and unit else None
+                columns.append(Column(name, len(channel), _reader(channel), unit, _waveform(said)))
         yield columns
 
 
@@ -222,12 +214,15 @@ def _reader(channel: Any) -> Read:
 
 
 def _waveform(said: Mapping[str, Any]) -> EvenTimes | None:
-    step = float(said.get("wf_increment") or 0.0)
-    if not step > 0:
+    """The clock of a channel; None where its properties are none, whatever they are."""
+    step, start = said.get("wf_increment"), said.get("wf_start_time")
+    if not isinstance(step, int | float) or not 0 < step < math.inf:
         return None
-    start = said.get("wf_start_time")
-    offset = round(float(said.get("wf_start_offset") or 0.0) * SECOND)
-    if start is None:
+    try:
+        offset = round(float(said.get("wf_start_offset") or 0.0) * SECOND)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    if not isinstance(start, np.datetime64 | datetime):
         return EvenTimes(offset, step, True)
     began = int(np.datetime64(start).astype("datetime64[ns]").astype(np.int64))
     return EvenTimes(began + offset, step, began < 0)

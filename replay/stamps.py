@@ -52,7 +52,7 @@ class Stamps:
         if self._first is None:
             if not finite.any():
                 return np.zeros(len(cells), dtype=np.int64), finite
-            self._begin(cells[int(np.argmax(finite))])
+            self._begin(_first_usual(cells[finite]))
         with np.errstate(invalid="ignore", over="ignore"):
             if cells.dtype.kind in "iu":
                 apart = (cells.astype(np.int64) - np.int64(self._first)).astype(np.float64)
@@ -84,7 +84,8 @@ class Stamps:
             )
 
     def _written(self, cells: Sequence[Any] | NDArray[Any]) -> tuple[IntArray, BoolArray]:
-        stamps = [self._instant(str(cell)) for cell in cells]
+        instants = (self._instant(str(cell)) for cell in cells)
+        stamps = [None if instant is None or abs(instant) >= LATEST else instant for instant in instants]
         good = np.array([stamp is not None for stamp in stamps], dtype=bool)
         return np.array([stamp or 0 for stamp in stamps], dtype=np.int64), good
 
@@ -133,6 +134,18 @@ class Stamps:
             return (date(year, month, day) - date(1970, 1, 1)).days
         except ValueError:
             return None
+
+
+def _first_usual(stamps: NDArray[Any]) -> Any:
+    """The first stamp that is of the same kind as most: a logger's first one may be 0, or anything else."""
+
+    def kind(stamp: Any) -> tuple[str, bool, bool]:
+        size = abs(float(stamp))
+        unit = next((name for least, _, name in _MAGNITUDES if size > least), "s")
+        return unit, size < ABSOLUTE, stamp < 0
+
+    usual = kind(np.sort(stamps)[len(stamps) // 2])
+    return next(stamp for stamp in stamps if kind(stamp) == usual)
 
 
 def is_written(cell: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +16,9 @@ from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, Sampl
 from sprung.model.units import FACTORS, known
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.bounds import check_samples
-from sprung.replay.csvlayout import unit_in
+from sprung.replay.csvlayout import number, unit_in
 from sprung.replay.multirate import MultirateColumns
-from sprung.replay.stamps import SECOND, Stamps
+from sprung.replay.stamps import LATEST, SECOND, Stamps, is_written
 
 ROWS = 16_384  # that are handed out together
 MOST_COLUMNS = 10_000
@@ -48,6 +49,7 @@ class Column:
     unit: str | None = None
     clock: EvenTimes | None = None
     sheet: int = 0  # of an array with more than two axes, from 0
+    lacking: int = 0  # values that the file states and does not hold
 
     @property
     def group(self) -> str:
@@ -224,6 +226,8 @@ def column_blocks(
     names = [column.name for column in columns]
     for column in columns:
         account.contents[column.name] = column.length
+        if column.lacking:
+            account.problem(f"{column.name} states {column.lacking} more values than the file holds")
     found = find_columns(path, names, channels, account)
     check_samples(path, sum(columns[at].length for _, at in found))
     by_time: dict[Any, list[tuple[int, Column]]] = {}
@@ -299,6 +303,7 @@ class _Series:
         self._slower = MultirateColumns()
         self._epoch = key.epoch or 0
         self._at = 0
+        self._wrong: Counter[str] = Counter()  # values of each column that are no numbers
         self._held: list[SampleBlock] = []
         if isinstance(time, EvenTimes):
             account.relative = account.relative or (time.relative and key.epoch is None)
@@ -330,19 +335,50 @@ class _Series:
         a, b = self._at, min(self._at + ROWS, self.length)
         self._at = b
         if isinstance(self.time, EvenTimes):
-            shift = self._epoch if self.time.relative else 0
-            stamps = self.time.start + shift + np.rint(np.arange(a, b) * (self.time.step * SECOND)).astype(np.int64)
-            good = np.ones(b - a, dtype=bool)
+            start = self.time.start + (self._epoch if self.time.relative else 0)
+            elapsed = np.rint(np.arange(a, b) * (self.time.step * SECOND))
+            good = np.abs(elapsed + float(start)) < LATEST  # False for NaN
+            stamps = np.where(good, elapsed, 0).astype(np.int64) + (start if good.any() else 0)
         else:
-            stamps, good = self._stamps.nanoseconds(self.time.read(a, b))
+            cells = self.time.read(a, b)
+            if cells.dtype.kind in "OUS" and not any(is_written(str(cell)) for cell in cells):
+                cells = floats(cells)[0]
+            stamps, good = self._stamps.nanoseconds(cells)
         self.account.corrupt(int((~good).sum()), "row without a time")
-        values = np.stack([np.asarray(c.read(a, b), dtype=np.float64) for _, c in self.members], axis=1)[good]
+        read = [floats(c.read(a, b)) for _, c in self.members]
+        for (_, column), (_, wrong) in zip(self.members, read, strict=True):
+            self._wrong[column.name] += wrong
+        if b == self.length:
+            for name, wrong in (+self._wrong).items():
+                self.account.problem(f"{name}: {wrong} of its values are no numbers, and taken as missing")
+        values = np.stack([numbers for numbers, _ in read], axis=1)[good]
         empty = np.isnan(values)
         self.account.drop(int(empty.all(axis=1).sum()), "no valid value")
         self.account.tally.used += int((~empty.all(axis=1)).sum())
         kept, missing = self._slower.kept(stamps[good], empty)
         self.account.values["empty or NaN"] += missing
         return _samples(stamps[good], np.array([place for place, _ in self.members], dtype=np.int32), values, kept)
+
+
+def floats(values: NDArray[Any]) -> tuple[FloatArray, int]:
+    """Values as floats, NaN for what is no number, and how many of those there are; None and NaN are merely missing."""
+    if values.dtype.kind in "fiub":
+        return values.astype(np.float64, copy=False), 0
+    out = np.full(len(values), np.nan)
+    if values.dtype.kind not in "OUS":  # times, complex numbers, records
+        return out, len(values)
+    wrong = 0
+    for row, cell in enumerate(values):
+        try:
+            if isinstance(cell, str | bytes):
+                out[row] = number(cell.decode("latin-1") if isinstance(cell, bytes) else cell, False)
+            elif cell is not None:
+                out[row] = float(cell)
+        except (TypeError, ValueError):
+            wrong += 1
+        except OverflowError:  # an integer beyond all floats: missing, as those beyond what is plausible
+            pass
+    return out, wrong
 
 
 def _samples(time: IntArray, index: NDArray[np.int32], values: FloatArray, kept: BoolArray) -> SampleBlock:

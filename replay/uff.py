@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -37,6 +37,7 @@ class _Function:
     clock: EvenTimes | None  # None: uneven, `times` holds them
     times: NDArray[np.float64] | None  # s
     values: NDArray[np.float64]
+    lacking: int  # values that are stated and not there
 
 
 def columns(path: Path) -> list[Column]:
@@ -46,7 +47,7 @@ def columns(path: Path) -> list[Column]:
         raise UnreadableRecording(f"{path}: not a universal file (no '    -1' line at its beginning)")
     try:
         functions = [found for found in _datasets(data) if found is not None]
-    except (ValueError, IndexError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise UnreadableRecording(f"{path}: a damaged dataset 58: {error}") from error
     if not functions:
         raise UnreadableRecording(f"{path}: no time responses (dataset 58, function type 1) in it")
@@ -57,9 +58,10 @@ def columns(path: Path) -> list[Column]:
         if not name or (name == f.title and titles[f.title] > 1):
             name = f"{f.place or f.title or 'response'} #{i + 1}"
         if f.times is None:
-            out.append(whole(name, f.values, f.unit, f.clock))
+            out.append(replace(whole(name, f.values, f.unit, f.clock), lacking=f.lacking))
         else:
-            out += [whole(f"{name}/time", f.times, "s"), whole(f"{name}/value", f.values, f.unit)]
+            value = whole(f"{name}/value", f.values, f.unit)
+            out += [whole(f"{name}/time", f.times, "s"), replace(value, lacking=f.lacking)]
     return out
 
 
@@ -79,6 +81,8 @@ def _datasets(data: bytes) -> Iterator[_Function | None]:
             lines.append(line)
         if head[6:7].lower() == b"b" or kind[0] == b"58b":
             size = int(head[31:43])
+            if size < 0:
+                raise ValueError(f"it states {size} bytes")
             body, at = data[at : at + size], at + size
             order = "<" if int(head[7:13]) == 1 else ">"
             if int(head[13:19]) != 2:
@@ -139,6 +143,8 @@ def _shape(lines: list[bytes]) -> tuple[int, int, bool]:
     """Kind of the ordinate, number of values, and whether the abscissa is even."""
     record = lines[6]
     kind, count, even = int(record[:10]), int(record[10:20]), int(record[20:30]) == 1
+    if count < 0:
+        raise ValueError(f"it states {count} values")
     if kind not in KINDS:
         raise ValueError(f"unknown kind of data {kind}")
     return kind, count, even
@@ -152,9 +158,9 @@ def _function(lines: list[bytes], numbers: NDArray[np.float64]) -> _Function | N
         return None
     title, place, unit = _or_none(text[0].strip()) or "", _place(text[5]), _or_none(text[8][47:67].strip())
     if even:
-        return _Function(title, place, unit, _even_times(text), None, numbers[:count])
-    pairs = numbers[: 2 * count].reshape(-1, 2)
-    return _Function(title, place, unit, None, pairs[:, 0], pairs[:, 1])
+        return _Function(title, place, unit, _even_times(text), None, numbers[:count], max(0, count - len(numbers)))
+    pairs = numbers[: min(2 * count, len(numbers) // 2 * 2)].reshape(-1, 2)
+    return _Function(title, place, unit, None, pairs[:, 0], pairs[:, 1], count - len(pairs))
 
 
 def _is_time_response(text: list[str], kind: int) -> bool:

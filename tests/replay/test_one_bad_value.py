@@ -1,0 +1,151 @@
+"""One value, time or count that is none costs itself, is reported, and leaves the rest as it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sprung.model.signals import Channel
+from sprung.replay import UnreadableRecording
+from tests.fuzz.seeds import TABLE, UNIVERSAL
+from tests.replay_files import LEFT, NUMBERS, RIGHT, read, uff58
+
+EPOCH = 1_790_000_000
+ROWS, BAD = 200, 120
+SECONDS = NUMBERS / 100
+
+
+def table(times: list[str], left: list[str]) -> str:
+    rows = [f"{t},{x},{i % 5}" for i, (t, x) in enumerate(zip(times, left, strict=True))]
+    return "\n".join(["time,left,right", *rows]) + "\n"
+
+
+def objects(times: list[str], left: list[str]) -> str:
+    right = json.dumps([i % 5 for i in range(ROWS)])
+    return f'{{"time": [{", ".join(times)}], "left": [{", ".join(left)}], "right": {right}}}'
+
+
+def by_row(times: list[str], left: list[str]) -> str:
+    rows = (f'{{"time": {t}, "left": {x}, "right": {i % 5}}}' for i, (t, x) in enumerate(zip(times, left, strict=True)))
+    return f"[{', '.join(rows)}]"
+
+
+@pytest.mark.parametrize("at", [0, BAD])
+@pytest.mark.parametrize("scale", [1, 1000])
+@pytest.mark.parametrize("bad", ["0", "1e300", "-5e9", "9e18"])
+@pytest.mark.parametrize(("name", "make"), [("a.csv", table), ("a.json", objects)])
+def test_a_time_that_is_none_costs_its_row(
+    name: str, make: Callable[[list[str], list[str]], str], bad: str, scale: int, at: int, tmp_path: Path
+) -> None:
+    """Also the first one, by which unit and epoch are recognised."""
+    times = [f"{scale * (EPOCH + i / 100):.3f}" for i in range(ROWS)]
+    times[at] = bad
+    (tmp_path / name).write_text(make(times, [str(i % 7) for i in range(ROWS)]))
+    _, samples = read(tmp_path / name, channels=TABLE)
+    stamps, values = samples[0]
+    kept = np.abs(stamps / 1e9 - EPOCH) < 10
+    expected = [i for i in range(ROWS) if i != at]
+    assert stamps[kept] == pytest.approx([(EPOCH + i / 100) * 1e9 for i in expected], abs=1000)
+    assert values[kept].tolist() == [i % 7 for i in expected]
+
+
+@pytest.mark.parametrize("at", [0, BAD])
+@pytest.mark.parametrize(
+    "bad", ["0001-01-01T00:00:00", "9999-12-31T23:59:59", "1600-01-01 00:00:00", "2262-12-31 00:00"]
+)
+def test_a_date_that_no_clock_shows_costs_its_row(bad: str, at: int, tmp_path: Path) -> None:
+    """0001 and 9999 are what databases and .NET write where there is none."""
+    times = [f"2026-01-01T00:00:{i / 100:05.2f}" for i in range(ROWS)]
+    times[at] = bad
+    (tmp_path / "a.csv").write_text(table(times, ["1"] * ROWS))
+    recording, samples = read(tmp_path / "a.csv", channels=TABLE)
+    assert len(samples[0][0]) == ROWS - 1
+    assert recording.incomplete and recording.tally.corrupt == 1
+
+
+@pytest.mark.parametrize(
+    ("bad", "reported"), [('"x"', True), ("[1]", True), ("{}", True), ("null", False), ('"N/A"', False)]
+)
+@pytest.mark.parametrize("make", [objects, by_row])
+def test_a_value_in_json_that_is_no_number_costs_itself(
+    make: Callable[[list[str], list[str]], str], bad: str, reported: bool, tmp_path: Path
+) -> None:
+    left = [str(i % 7) for i in range(ROWS)]
+    left[BAD] = bad
+    (tmp_path / "a.json").write_text(make([str(i / 100) for i in range(ROWS)], left))
+    recording, samples = read(tmp_path / "a.json", channels=TABLE)
+    values = dict(zip(np.rint(samples[0][0] / 1e7).astype(int).tolist(), samples[0][1].tolist(), strict=True))
+    assert np.isnan(values.pop(BAD, np.nan))
+    assert values == {i: i % 7 for i in range(ROWS) if i != BAD}
+    assert len(samples[1][0]) == ROWS  # the others
+    told = [line for line in recording.problems if "are no numbers" in line]
+    assert len(told) == reported and recording.incomplete == reported
+
+
+def damaged(record: int, first: int, text: str) -> bytes:
+    """A universal file in whose first dataset a field of a record is another one."""
+    one = uff58(12, 3, LEFT, times=SECONDS)
+    lines = one.split(b"\n")
+    lines[record] = lines[record][:first] + text.encode() + lines[record][first + len(text) :]
+    return b"\n".join(lines) + uff58(7, -1, RIGHT, times=SECONDS)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (damaged(8, 10, f"{10**9:10d}"), "states 999999700 more values than the file holds"),
+        (uff58(7, -1, RIGHT, times=SECONDS) + uff58(12, 3, LEFT, times=SECONDS, binary="<")[:-900], "more values"),
+    ],
+)
+def test_universal_files_that_hold_less_than_they_state_are_incomplete(
+    content: bytes, told: str, tmp_path: Path
+) -> None:
+    (tmp_path / "a.uff").write_bytes(content)
+    recording, samples = read(tmp_path / "a.uff", channels=UNIVERSAL)
+    assert recording.incomplete and any(told in line for line in recording.problems)
+    assert len(samples[1][0]) == len(RIGHT) and len(samples[0][0]) > 100
+
+
+@pytest.mark.parametrize("size", [-1, -600, -870, -900, -1200])
+def test_negative_sizes_do_not_lead_back(size: int, tmp_path: Path) -> None:
+    whole = uff58(12, 3, LEFT, times=SECONDS, binary="<")
+    head = whole.split(b"\n")[1]
+    (tmp_path / "a.uff").write_bytes(whole.replace(head, head[:31] + f"{size:12d}".encode() + head[43:], 1))
+    with pytest.raises(UnreadableRecording, match=f"it states {size} bytes"):
+        read(tmp_path / "a.uff", channels=UNIVERSAL)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"wf_increment": "abc"},
+        {"wf_increment": np.inf},
+        {"wf_increment": 0.01, "wf_start_offset": 1e300},
+        {"unit_string": 5},
+    ],
+)
+def test_properties_of_tdms_that_are_none_are_passed_over(said: dict[str, Any], tmp_path: Path) -> None:
+    nptdms = pytest.importorskip("nptdms")
+    columns = {"time": SECONDS, "left": LEFT, "right": RIGHT}
+    with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:
+        writer.write_segment([nptdms.ChannelObject("group", n, v, properties=said) for n, v in columns.items()])
+    channels = [Channel(c.name, c.unit, c.noise, column=f"group/{c.csv}") for c in TABLE]
+    _, samples = read(tmp_path / "a.tdms", channels=channels)
+    assert samples[0][1].tolist() == LEFT.tolist()
+
+
+def test_complex_numbers_of_tdms_are_no_samples(tmp_path: Path) -> None:
+    nptdms = pytest.importorskip("nptdms")
+    columns = {"time": SECONDS, "left": LEFT + 1j, "right": RIGHT}
+    with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:
+        writer.write_segment([nptdms.ChannelObject("group", name, values) for name, values in columns.items()])
+    channels = [Channel(c.name, c.unit, c.noise, column=f"group/{c.csv}") for c in TABLE]
+    recording, samples = read(tmp_path / "a.tdms", channels=channels)
+    assert np.isnan(samples[0][1]).all()  # what is real of them would be taken for it
+    assert "group/left: 300 of its values are no numbers, and taken as missing" in recording.problems
+    assert samples[1][1].tolist() == RIGHT.tolist()
