@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -83,7 +83,7 @@ def _absolute(seconds: FloatArray, start: int) -> tuple[IntArray, BoolArray]:
 
 
 @contextmanager
-def _opened(path: Path, unfinished: bool) -> Iterator[Path | IO[bytes]]:
+def _opened(path: Path, unfinished: bool) -> Iterator[Any]:
     """What asammdf reads: the file, or, of one that a logger did not finish and that asammdf completes, a copy.
 
     asammdf's own copy stays for ever when the file turns out to be damaged, or the process is killed; this one has no
