@@ -96,7 +96,7 @@ class Conditions:
         return abs(self.lateral) > CURVE
 
 
-FaultKind = Literal["gain", "delay", "frozen", "saturated", "inverted", "swapped"]
+FaultKind = Literal["gain", "delay", "frozen", "saturated", "inverted", "swapped", "silent"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ class MeasurementFault:
 
     channel: str  # several that share it are joined by |
     kind: FaultKind
-    value: float  # gain: reading over truth; delay: s by which it reads late; frozen, saturated: the reading
+    value: float  # gain: reading over truth; delay: s by which it reads late; frozen, saturated: the reading; else 0
     std: float = 0.0
 
 
@@ -150,7 +150,7 @@ class Estimate:
     converged: bool
     iterations: int
     states: FloatArray | None = None  # simulated states, shape (T, N), only when asked for
-    outputs: FloatArray | None = None  # simulated sensors, shape (T, S), with the states of systems with laws
+    outputs: FloatArray | None = None  # simulated sensors, shape (T, S), with the states
     deviating: Deviating | None = None  # where it was asked for, or refined elsewhere than at the system file
     faults: tuple[MeasurementFault, ...] = ()  # that had to be taken back before the window fitted
     informative: bool = True  # False: too little excitation for any conclusion

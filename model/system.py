@@ -12,8 +12,8 @@ import numpy as np
 
 from sprung.model.address import Address
 from sprung.model.digest import digest_of, structure_of
-from sprung.model.laws import CATALOGUE, ElementLaw, Law
-from sprung.model.laws.in_place import Follower, MechanicsWithLaws, all_in_place, misplaced
+from sprung.model.laws import CATALOGUE, ElementLaw, Law, SensorLaw
+from sprung.model.laws.in_place import Follower, MechanicsWithLaws, all_in_place, is_linear, misplaced
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, Mode, assemble
@@ -42,6 +42,7 @@ AXLE_STD = 0.03  # of an axle's mass that the file states without a deviation: w
 LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations
 USUAL_SPEED = 30.0  # m/s, taken for curves where only the yaw rate is measured
 COLDEST, HOTTEST = -70.0, 150.0  # degC; beyond, a probe is broken, and the temperature unknown
+ALONG = ("displacement", "velocity")  # quantities of a support that say where it is, as laws need
 _HELD = 1e-3  # Hz, a slower mode is one that nothing holds, but for rounding
 SHORTEST_TRACK = 10.0  # s, of a window of a vehicle with unmeasured wheels
 
@@ -201,10 +202,29 @@ class System:
         """Measured signals that parameters may follow; a diagnosis reads them after `channels`."""
         return tuple(_signal_channel(name, at) for name, at in self.file.signals.items())
 
-    @property
-    def needed_inputs(self) -> int:
-        """Leading channels without which a window is worthless; a speed that is missing is estimated."""
-        return 0 if self.on_track else len(self.inputs)
+    def without(self, channels: frozenset[str]) -> System:
+        """The system while these channels of inputs are not measured."""
+        return replace(self, lost=self.lost | channels)
+
+    @cached_property
+    def needed(self) -> tuple[frozenset[str], ...]:
+        """Sets of channels of inputs, of each of which a window must contain one at least.
+
+        Where signals superpose, whatever one support does can be told from the others': one input is enough.  Laws act
+        along deflections, so that every support must be measured, and not by its acceleration alone.  A speed that is
+        missing is estimated.
+        """
+        if self.on_track or not self.inputs:
+            return ()
+        if all(is_linear(placed) or isinstance(placed.law, SensorLaw) for placed in self.laws):
+            return (frozenset(channel.name for channel in self.inputs),)
+        sets = []
+        for name, source in self.file.inputs.items():
+            if isinstance(source, SupportInput):
+                sets.append(frozenset(f"{name}.{quantity}" for quantity in source.measured if quantity in ALONG))
+            else:
+                sets.append(frozenset([name]))
+        return tuple(sets)
 
     @cached_property
     def on_track(self) -> bool:

@@ -15,7 +15,7 @@ from sprung.replay.stream import ClockJump, Reorderer
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
 MOST_WINDOWS = 64  # that are made together
-MOSTLY_THERE = 0.2  # share of missing samples above which a channel is looked at as one of a lower rate
+MOSTLY_THERE = 0.2  # share of missing samples above which a channel is looked at as one of a lower rate, or is absent
 COHERENT = 0.5  # mean resultant length of the phases above which they have a common phase
 KEPT_JUMPS = 1000
 MOST_RATE = 100  # times the grid's rate: a stream of more samples than all channels give at this one stands still
@@ -50,20 +50,22 @@ class Windower:
         window: int,
         hop: int | None = None,
         *,
-        inputs: frozenset[str] | int = 0,
+        needed: Sequence[frozenset[str]] = (),
         longest_gap: int = 2,
         largest_share: float = 0.03,
         delay: float = 0.5,
         pause: float = 5.0,
         stamped: bool = False,
     ) -> None:
-        """`inputs`: names (or number of leading) channels without which a window is worthless; `longest_gap`
-        consecutive samples and `largest_share` of a window's samples may be repaired; `delay`: s that samples may
-        come out of order; `pause`: s of silence after which the grid starts anew; `stamped`: times are those
-        of sampling, not of arrival, so that uneven ones can be interpolated between."""
+        """`needed`: sets of channels, of each of which a window must hold one; other channels may be absent.
+        `longest_gap` consecutive samples and `largest_share` of a window's samples may be repaired; `delay`: s that
+        samples may come out of order; `pause`: s of silence after which the grid starts anew; `stamped`: times are
+        those of sampling, not of arrival, so that uneven ones can be interpolated between."""
         if window < 4 or not sample_rate > 0:
             raise ValueError(f"a window needs at least 4 samples and a positive rate, not {window} at {sample_rate}")
-        self.channels, self.is_input = tuple(channels), _are_inputs(channels, inputs)
+        self.channels = tuple(channels)
+        self.needed = [np.array([channel.name in names for channel in self.channels]) for names in needed]  # each (C,)
+        self.wanted: BoolArray = np.any(self.needed, axis=0) if needed else np.zeros(len(self.channels), dtype=bool)
         self.sample_rate, self.window = float(sample_rate), int(window)
         self.hop = int(hop) if hop else max(self.window // 2, 1)
         self.longest_gap, self.largest_share = longest_gap, largest_share
@@ -187,13 +189,6 @@ class Windower:
         self._waiting = int(keep.sum())
 
 
-def _are_inputs(channels: Sequence[Channel], inputs: frozenset[str] | int) -> BoolArray:
-    """Which channels (C,) are inputs, by their names or as the number of leading ones."""
-    names = [channel.name for channel in channels]
-    wanted = set(names[:inputs]) if isinstance(inputs, int) else inputs
-    return np.array([name in wanted for name in names])
-
-
 class _Batch:
     """Several consecutive windows at once: everything that can be done for all of them together."""
 
@@ -259,6 +254,10 @@ class _Batch:
             if note and note not in notes:
                 notes.append(note)
         absent = (missing == owner.window) & (unfilled == owner.window)
+        torn = ~absent & (unfilled > MOSTLY_THERE * owner.window)  # as by a loose contact
+        if not (absent | torn).all():  # what is left of them is worth less than the window
+            absent |= torn
+            notes += [f"gaps in {owner.channels[c].name}" for c in np.flatnonzero(torn)]
         values[:, absent] = np.nan
         owner._count(gone)
         start = owner._base + round(self.origin + index * owner.hop * owner._period)
@@ -269,6 +268,8 @@ class _Batch:
         repaired = int(missing[~absent].sum())
         if repaired:
             notes.insert(0, "missing samples interpolated")
+        if len(lacking := np.flatnonzero(absent & owner.wanted)):
+            notes = list(dict.fromkeys([self._missing(lacking, notes), *notes]))
         if notes:
             owner.account.reasons[notes[0]] += 1
             return Window(start, owner.sample_rate, values, "repaired", "; ".join(notes[:4]), repaired)
@@ -281,11 +282,9 @@ class _Batch:
         owner = self.owner
         if absent.all():
             return notes[0] if notes else "no samples"
-        names = [channel.name for channel in owner.channels]
-        lacking = np.flatnonzero(absent & owner.is_input)
-        if len(lacking):
-            name = names[lacking[0]]
-            return next((note for note in notes if note.startswith(f"{name} ")), f"missing input {name}")
+        lacking = next((np.flatnonzero(columns) for columns in owner.needed if absent[columns].all()), None)
+        if lacking is not None:
+            return self._missing(lacking, notes)
         present = ~absent
         cells = owner.window * int(present.sum())
         if conflict[present].sum() > owner.largest_share * cells:
@@ -294,8 +293,14 @@ class _Batch:
             return "too many missing samples"
         broken = np.flatnonzero(present & (unfilled > 0))
         if len(broken):
-            return f"gap in {names[broken[0]]}"
+            return f"gap in {owner.channels[broken[0]].name}"
         return None
+
+    def _missing(self, columns: IntArray, notes: Sequence[str]) -> str:
+        """Why there is nothing of some channels, in words: the first one's name stands for all."""
+        name = self.owner.channels[columns[0]].name
+        said = next((note for note in notes if note.startswith(f"{name} ")), f"missing input {name}")
+        return said if len(columns) == 1 else f"{said} and {len(columns) - 1} more"
 
     def _resampled(self, channel: int, rows: slice) -> tuple[Resampled, str | None]:
         """One channel that does not lie on the grid, and a remark for the user."""

@@ -166,10 +166,10 @@ def identify(
 ) -> IdentifiedWindow:
     """Stiffness and damping of every element from one window.
 
-    values: shape (T, C) in the order of `system.channels`, or one array per channel name; an absent sensor is NaN or
-    left out, inputs have to be there.
+    values: shape (T, C) in the order of `system.channels`, or one array per channel name; an absent channel is
+    NaN or left out.
     model: `load_identifier(system, folder)` for weights of your own; the bundled ones, or the nominal start, otherwise.
-    Errors: `UnusableWindow`.
+    Errors: `UnusableWindow`, also for a window that has no values, as one without any input.
 
     >>> import numpy as np, sprung
     >>> system = sprung.load_system()
@@ -185,6 +185,8 @@ def identify(
     """
     window = _window(system, values)
     estimate = (model or load_identifier(system)).identify(window[None])[0]
+    if not estimate.identified:
+        raise UnusableWindow(f"{system.name}: {estimate.reason}")
     return IdentifiedWindow(_values(system, estimate), estimate)
 
 

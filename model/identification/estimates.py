@@ -6,6 +6,7 @@ import numpy as np
 
 from sprung.model.identification.faults import fit_limit
 from sprung.model.identification.refine import Refined
+from sprung.model.identifier import PRIOR_STD
 from sprung.model.signals import Deviating, Estimate, FloatArray
 
 EXCITED = 20.0  # power of an input over its noise; below, what sensors show is not the response to the inputs
@@ -42,7 +43,7 @@ def estimates(
             converged=bool(refined.converged[b]),
             iterations=int(refined.iterations[b]),
             states=refined.states[b] if states else None,
-            outputs=refined.outputs[b] if states and refined.outputs.shape[1] else None,
+            outputs=refined.outputs[b] if states else None,
             informative=bool(informative[b]),
             running=bool(moved[b] and not informative[b]),
             deviating=deviating[b],
@@ -52,6 +53,23 @@ def estimates(
         )
         for b in range(len(refined.log_ratio))
     ]
+
+
+def not_identified(P: int, S: int, reason: str) -> Estimate:
+    """That of a window of P parameters and S sensors that has no values, for a reason."""
+    return Estimate(
+        log_ratio=np.zeros(P),
+        covariance=np.eye(P) * PRIOR_STD**2,
+        identifiable=np.zeros(P, dtype=bool),
+        nrmse=float("nan"),
+        per_sensor=np.full(S, np.nan),
+        chi_square=float("nan"),
+        adequate=False,
+        converged=False,
+        iterations=0,
+        identified=False,
+        reason=reason,
+    )
 
 
 def longer_than(limit: str) -> str:

@@ -19,11 +19,12 @@ import numpy as np
 import torch
 from scipy.interpolate import make_interp_spline
 
+from sprung.model.identification.any_inputs import RefinerOfAnyInputs
 from sprung.model.identification.contradictions import Contradictions, Rearrangement
 from sprung.model.identification.deviations import clock_groups, named
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.linearise import as_rows
-from sprung.model.identification.refine import Refined, Refines
+from sprung.model.identification.refine import Refined
 from sprung.model.identification.stuck import STUCK, StuckChannels
 from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
 from sprung.model.system import System
@@ -70,16 +71,10 @@ class Explainer:
         self,
         system: System,
         samples: int,
-        refiner: Callable[[int], Refines],
-        start: Callable[[FloatArray], FloatArray] | None,
-        without: Callable[[int, frozenset[str]], Refines] | None = None,
+        refiner: Callable[[int], RefinerOfAnyInputs],
+        start: Callable[[FloatArray], FloatArray | None],
     ) -> None:
-        """refiner: of windows of so many samples; start: from windows (B, T, C) to log-ratios to refine from.
-
-        without: refiner of windows of so many samples in which channels of inputs are lost; None: a system, as one with
-        laws, whose inputs are all needed.
-        """
-        self._lossy = without
+        """refiner: of windows of so many samples; start: from windows (B, T, C) to log-ratios to refine from."""
         self.system, self.samples, self.start, self.refiner = system, samples, start, refiner
         deviations = refiner(samples).calibration.deviations
         self.deviations = deviations
@@ -148,11 +143,9 @@ class Explainer:
         return {int(rows[agree[i]]): e for i, e in explained.items()}
 
     def _can_lose(self, columns: IntArray) -> bool:
-        """Whether windows can be refined without these channels: some input must be left, unless sensors alone are
-        lost."""
-        inputs = len(self.system.inputs)
-        lost = int(np.count_nonzero(np.unique(columns) < inputs))
-        return lost == 0 or (self._lossy is not None and lost < inputs)
+        """Whether windows can be refined without these channels."""
+        lost = {self.names[column] for column in columns.tolist()}
+        return not any(names <= lost for names in self.system.needed)
 
     def contradictory(self, windows: FloatArray, bad: IntArray) -> dict[int, FaultExplanation]:
         """Explanations, by index, of those of the windows `bad` of a batch (B, T, C) whose redundant channels
@@ -187,7 +180,7 @@ class Explainer:
     def _costs(self, windows: FloatArray, candidates: Sequence[Rearrangement]) -> FloatArray:
         """Chi-square of refined windows (B, T, C), together, with each of the candidates undone."""
         restored = np.concatenate([candidate.undone(windows) for candidate in candidates])
-        start, along = None if self.start is None else self.start(restored), self._along
+        start, along = self.start(restored), self._along
         refined = self.refiner(self.samples).refine(restored, start, loads=along, built=along, iterations=ITERATIONS)
         return np.asarray((refined.chi_square * refined.freedom).reshape(len(candidates), -1).sum(axis=1))
 
@@ -298,19 +291,17 @@ class Explainer:
 
     def _refined(self, windows: FloatArray, point: FloatArray, loads: BoolArray) -> list[Refined]:
         """Corrected windows refined, with their evidence; one `Refined` of one window each."""
-        margin, first = self.margin(point), len(self.system.inputs)
-        lost: BoolArray = np.asarray(np.isnan(windows[:, :, :first]).any(axis=1))
-        alike = np.unique(np.column_stack([margin, loads, lost]).astype(np.int64), axis=0, return_inverse=True)[1]
+        margin = self.margin(point)
+        alike = np.unique(np.column_stack([margin, loads]).astype(np.int64), axis=0, return_inverse=True)[1]
         out: list[Refined | None] = [None] * len(windows)
         for group in np.unique(alike):
             rows = np.flatnonzero(alike == group)
             edge, with_loads = int(margin[rows[0]]), bool(loads[rows[0]])
             restored = self.corrected(windows[rows], point[rows])
-            start = None if self.start is None or lost[rows[0]].any() else self.start(restored)
             inner = restored[:, edge : self.samples - edge]
-            refined = self._refiner_of(inner.shape[1], lost[rows[0]]).refine(
-                np.where(np.append(lost[rows[0]], np.zeros(inner.shape[2] - first, dtype=bool)), 0.0, inner),
-                start,
+            refined = self.refiner(inner.shape[1]).refine(
+                inner,
+                self.start(restored),
                 loads=with_loads,
                 built=with_loads,
                 weigh=np.ones(len(rows), dtype=bool),
@@ -319,12 +310,6 @@ class Explainer:
             for k, row in enumerate(rows):
                 out[row] = refined.take(np.array([k]))
         return [one for one in out if one is not None]
-
-    def _refiner_of(self, samples: int, lost: BoolArray) -> Refines:
-        """Refiner of windows of so many samples without the inputs that are `lost`, (I,)."""
-        if self._lossy is None or not lost.any():
-            return self.refiner(samples)
-        return self._lossy(samples, frozenset(self.names[c] for c in np.flatnonzero(lost)))
 
     def points(self, known: Sequence[tuple[MeasurementFault, ...]], windows: int) -> FloatArray:
         """The gains and delays among what is known of each of some windows as deviations, (B, H)."""
@@ -499,8 +484,11 @@ class Explainer:
 
     def _nominal_cost(self, windows: FloatArray) -> FloatArray:
         """Weighted squares at the nominal values with the best initial state, (B,)."""
-        refiner = self.refiner(windows.shape[1])
-        model = refiner.model
+        of_any = self.refiner(windows.shape[1])
+        lost = of_any.lacks(windows[:1])[0]
+        refiner = of_any.without(lost)
+        model, windows = refiner.model, windows.copy()
+        windows[:, :, np.flatnonzero(lost)] = 0.0
         present: BoolArray = np.asarray(~np.isnan(windows[0, :, len(self.system.inputs) :]).any(axis=0))
         with torch.no_grad():
             data = model.batch(model.knots(windows), windows, present)

@@ -13,8 +13,9 @@ import numpy as np
 
 from sprung.model.ambient.foreseen import foreseen
 from sprung.model.ambient.identify import AmbientIdentifier, OutputOnlyIdentifier
+from sprung.model.identification.any_inputs import RefinerOfAnyInputs
 from sprung.model.identification.deviations import deviations
-from sprung.model.identification.estimates import EXCITED, estimates
+from sprung.model.identification.estimates import EXCITED, estimates, not_identified
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.faults import Explainer, FaultExplanation, fits
@@ -28,7 +29,7 @@ from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
 from sprung.model.work import WorkBudget
 
-KEPT = 8  # refiners of windows without some inputs
+SOUGHT = ("frozen", "saturated", "inverted", "swapped")  # known faults that windows are looked at for first
 MANY = 24  # windows of a batch without start values, from which on some are refined first to start the others
 PILOTS = 6  # of these; their median is near, since batches are of one vehicle for the most part
 NOT_EXPLAINED = "whether a measurement is wrong was not looked into to the end: it takes longer than "
@@ -52,8 +53,7 @@ class Identifier:
     workers: int = 1
     seconds: float = math.inf
     times: StageTimes = field(default_factory=StageTimes)
-    _refiners: dict[int, Refines] = field(default_factory=dict)
-    _lossy: dict[tuple[int, frozenset[str]], Refines] = field(default_factory=dict)
+    _refiners: dict[int, RefinerOfAnyInputs] = field(default_factory=dict)
     _explainers: dict[int, Explainer] = field(default_factory=dict)
     _model_uncertainty: ModelUncertainty | None = None
     _work: WorkBudget = field(default_factory=_no_limit)
@@ -73,14 +73,20 @@ class Identifier:
     ) -> list[Estimate]:
         """One `Estimate` per window.
 
-        windows: (B, T, C) in the order of `system.channels`, NaN columns for absent sensors.
+        windows: (B, T, C) in the order of `system.channels`, NaN columns for channels that are absent.
         start: log-ratios (B, P) to refine from, such as the tracker's; the estimator's where left out.
         weigh: windows (B,) whose evidence on gains, delays and loads is wanted, see `Estimate.deviating`.
-        Errors: `UnusableWindow` for a wrong shape or an input that is not finite.
+        A window that lacks inputs without which nothing can be said (`System.needed`) is not identified, with the
+        reason.  Errors: `UnusableWindow` for a wrong shape or infinite values.
         """
-        windows = self.system.undistorted(self._checked(windows))
+        windows = self._checked(windows)
+        usable = self._usable(windows)
+        if not usable.all():
+            given, wanted = None if start is None else start[usable], None if weigh is None else weigh[usable]
+            return self._unusable_among(windows, self.identify(windows[usable], given, states=states, weigh=wanted))
         if len(windows) == 0:
             return []
+        windows = self.system.undistorted(windows)
         self._allow(windows)
         loads = any(load.declared for load in self.system.loads)
         begin = time.perf_counter()
@@ -105,12 +111,18 @@ class Identifier:
         a window has them again, nothing else is tried; and gains and delays, which are taken back first, so that what
         a window says of measurements is linear in what is left of them.  windows, start: see `identify`.
         """
-        windows = self.system.undistorted(self._checked(windows))
+        windows = self._checked(windows)
+        usable = self._usable(windows)
+        if not usable.all():
+            some = [its for its, good in zip(known, usable, strict=True) if good] if known else ()
+            given = None if start is None else start[usable]
+            return self._unusable_among(windows, self.examine(windows[usable], weigh[usable], some, given))
         if len(windows) == 0:
             return []
+        windows = self.system.undistorted(windows)
         begin = time.perf_counter()
         self._allow(windows)
-        faults = [tuple(f for f in its if f.kind not in ("gain", "delay")) for its in known] or [()] * len(windows)
+        faults = [tuple(f for f in its if f.kind in SOUGHT) for its in known] or [()] * len(windows)
         explainer, whole = self._explainer(windows.shape[1]), np.empty(len(windows), dtype=object)
         points, estimating = explainer.points(known, len(windows)), 0.0
         for edge in np.unique(explainer.margin(points)):
@@ -148,6 +160,8 @@ class Identifier:
         for b in _left(plain, explained).tolist():
             if not whole[b].informative:
                 whole[b] = replace(whole[b], faults=explainer.stuck.all_inputs(windows[b]))
+        for b in np.flatnonzero(np.isnan(windows).any(axis=(1, 2))).tolist():
+            whole[b] = replace(whole[b], faults=(*whole[b].faults, *explainer.stuck.silent(windows[b])))
         if self._work.ended:
             whole |= {b: self._as_far_as_looked_into(whole[b]) for b in [*explained, *plain[asks].tolist()]}
         return [whole[b] for b in range(len(windows))]
@@ -181,14 +195,15 @@ class Identifier:
         """
         if len(windows) == 0:
             return []
-        refiner, loads, built = self._refiner(windows.shape[1]), bool(self.system.loads), bool(self.system.built)
+        loads, built = bool(self.system.loads), bool(self.system.built)
         parts: list[tuple[IntArray, Refined]] = []
 
         def refine(rows: IntArray, begin: FloatArray | None, along: partial[Refined]) -> Refined:
             parts.append((rows, along(windows[rows], begin, weigh=weigh[rows] & moved[rows])))
             return parts[-1][1]
 
-        linear, fully = isinstance(refiner, Refiner), partial(refiner.refine, loads=loads, built=built)
+        linear = not self._with_laws
+        fully = partial(self._refiner(windows.shape[1]).refine, loads=loads, built=built)
         stands = np.flatnonzero(~moved) if linear else np.zeros(0, dtype=np.int64)
         rides = np.setdiff1d(np.arange(len(windows)), stands)
         if len(stands):
@@ -218,7 +233,19 @@ class Identifier:
         """Log-ratios (B, P) to refine from: those given, or the estimator's where there is one."""
         if start is not None or self.estimator is None or windows.shape[1] != self.estimator.samples:
             return start
-        return self.estimator.start(windows, self.workers, loads=loads)
+        return self._begin(windows, self.workers, loads)
+
+    def _begin(self, windows: FloatArray, workers: int, loads: bool) -> FloatArray | None:
+        """The estimator's start; nominal values for windows that lack inputs, None where all of them do."""
+        whole = ~np.isnan(windows[:, :, : len(self.system.inputs)]).any(axis=(1, 2))
+        if self.estimator is None or not whole.any():
+            return None
+        found = self.estimator.start(windows[whole], workers, loads=loads)
+        if whole.all():
+            return found
+        start = np.zeros((len(windows), found.shape[1]))
+        start[whole] = found
+        return start
 
     def _estimates(self, refined: Refined, states: bool, points: FloatArray | None = None) -> list[Estimate]:
         """points: deviations (B, H) that were taken back from the samples before."""
@@ -273,43 +300,60 @@ class Identifier:
         if samples not in self._explainers:
             estimator = self.estimator
             fitting = estimator is not None and estimator.samples == samples
-            loads = bool(self.system.loads)
-            start = (lambda w: estimator.start(w, loads=loads)) if estimator and fitting else None
-            without = None if acting_laws(self.system) else self._refiner_without
-            self._explainers[samples] = Explainer(self.system, samples, self._refiner, start, without)
+            start = partial(self._begin, workers=1, loads=bool(self.system.loads)) if fitting else _nothing
+            self._explainers[samples] = Explainer(self.system, samples, self._refiner, start)
         return self._explainers[samples]
 
-    def _refiner(self, samples: int) -> Refines:
+    def _refiner(self, samples: int) -> RefinerOfAnyInputs:
         if samples not in self._refiners:
-            if acting_laws(self.system):
-                self._refiners[samples] = LawRefiner(self.system, samples, self.workers, self._work)
-            else:
-                self._refiners[samples] = Refiner(self.system.whole_system, samples, self.workers)
+            self._refiners[samples] = RefinerOfAnyInputs(self.system, partial(self._new_refiner, samples=samples))
         return self._refiners[samples]
 
-    def _refiner_without(self, samples: int, lost: frozenset[str]) -> Refines:
-        """That of windows in which these channels of inputs are not measured."""
-        key = samples, lost
-        if key not in self._lossy:
-            if len(self._lossy) >= KEPT:
-                del self._lossy[next(iter(self._lossy))]
-            self._lossy[key] = Refiner(replace(self.system.whole_system, lost=lost), samples, self.workers)
-        return self._lossy[key]
+    def _new_refiner(self, system: System, samples: int) -> Refines:
+        """Of this system or of it while channels are lost."""
+        if self._with_laws:
+            return LawRefiner(system, samples, self.workers, self._work)
+        return Refiner(system.whole_system, samples, self.workers)
+
+    @property
+    def _with_laws(self) -> bool:
+        """Whether laws act that make the system non-linear."""
+        return bool(acting_laws(self.system))
 
     def _checked(self, windows: FloatArray) -> FloatArray:
         windows = np.asarray(windows, dtype=np.float64)
         channels = self.system.channels
         if windows.ndim != 3 or windows.shape[2] != len(channels):
             raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
-        bad = ~np.isfinite(windows)
-        inputs = len(self.system.inputs)
-        for column in np.flatnonzero(bad.any(axis=(0, 1))):
-            if column < inputs:
-                raise UnusableWindow(f"{channels[column].name}: input is missing or not finite; every input is needed")
-        sensors = windows[:, :, inputs:]
-        if np.isinf(sensors).any():
-            raise UnusableWindow(f"{channels[inputs + int(np.argwhere(np.isinf(sensors))[0][2])].name}: not finite")
+        for column in np.flatnonzero(np.isinf(windows).any(axis=(0, 1))):
+            raise UnusableWindow(f"{channels[column].name}: not finite")
         return windows
+
+    def _lacks(self, windows: FloatArray) -> BoolArray:
+        """Of which sets of `System.needed` windows (B, T, C) have no channel, (B, sets)."""
+        names = [channel.name for channel in self.system.channels]
+        absent: BoolArray = np.asarray(np.isnan(windows).any(axis=1))
+        found: BoolArray = np.zeros((len(windows), len(self.system.needed)), dtype=np.bool_)
+        for i, some in enumerate(self.system.needed):
+            found[:, i] = absent[:, [names.index(name) for name in some]].all(axis=1)
+        return found
+
+    def _usable(self, windows: FloatArray) -> BoolArray:
+        """Which windows (B, T, C) have enough inputs, (B,)."""
+        return np.asarray(~self._lacks(windows).any(axis=1))
+
+    def _unusable_among(self, windows: FloatArray, found: list[Estimate]) -> list[Estimate]:
+        """One estimate for each of windows (B, T, C): those `found`, and none, with the reason, for the unusable."""
+        rest, P, S = iter(found), len(self.system.tracked), len(self.system.sensors)
+        first = [min(names) + (f" and {len(names) - 1} more" if len(names) > 1 else "") for names in self.system.needed]
+        return [
+            not_identified(P, S, f"missing input {first[int(np.argmax(lacks))]}") if lacks.any() else next(rest)
+            for lacks in self._lacks(windows)
+        ]
+
+
+def _nothing(windows: FloatArray) -> None:
+    """No start for windows (B, T, C)."""
 
 
 def load_identifier(

@@ -23,6 +23,7 @@ from sprung.model.system import System
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any informative window
 _RIDGE = 1e-11  # relative, on the normalised free responses
+_SETTLING = 4  # times; each leaves a quarter of what initial states and lost inputs contradict each other by
 _UNSEEN = 1e-13  # of the largest free response: below is rounding; those that are seen differ by 1e-4, units included
 
 
@@ -114,6 +115,15 @@ class WindowModel:
         at = self._residual(x, data)
         noise = self.noise_told(at.whiten, at.carried, at.left) * (self.drive_noise != self.instrument_noise)
         return replace(data, w=self._with_noise(data.w, noise))
+
+    def settled(self, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, WindowBatch]:
+        """Initial states x0 (B, N) and windows whose lost inputs move as their sensors say, which fit each other.
+
+        Motion of a lost input is told as a periodic one, and needs another initial state than none.
+        """
+        for _ in range(_SETTLING if self.lost else 0):
+            data = self.with_lost(x, data)
+        return (self._residual(x, data).x0 if self.lost else x0), data
 
     def _with_noise(self, w: Tensor, noise: Tensor) -> Tensor:
         """Knots (B, T, W) to which what the spectra (B, F, W/2) say is added."""
@@ -221,10 +231,12 @@ class WindowModel:
         error = self.compression.without_trends(error, data.present)
         return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt(), r, outputs, states)
 
-    def states(self, x: Tensor, x0: Tensor, data: WindowBatch) -> Tensor:
-        """Simulated states, (B, T, N)."""
+    def simulated(self, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
+        """States (B, T, N) and what all sensors show of them, (B, T, S)."""
         s = self.simulator
-        return s.states(s.discretise(s.element_values(x)), data.w, x0)
+        discrete = s.discretise(s.element_values(x))
+        states = s.states(discrete, data.w, x0)
+        return states, states @ discrete.C.mT + data.w @ discrete.D.mT
 
     def noise_told(self, whiten: Tensor, carried: Tensor, left: Tensor) -> Tensor:
         """Noise of the drives (B, F, W/2) as estimated from a whitened residual (B, F, R, 1) without free responses."""
@@ -256,6 +268,7 @@ class WindowModel:
 
     def excitation(self, windows: FloatArray) -> FloatArray:
         """Mean power over bins of the strongest input of windows (B, T, C), over that of its noise, (B,).
+        Inputs that are NaN do not count.
 
         About 1 at standstill.  Inputs without a stated noise have that of a usual instrument.
         """
@@ -263,7 +276,7 @@ class WindowModel:
         if not inputs.shape[2]:
             return np.full(len(windows), np.inf)
         power = self.spectra(torch.as_tensor(inputs)).abs().square().mean(dim=1).numpy() / self.samples
-        return np.asarray((power / self.input_noise**2).max(axis=1))
+        return np.asarray(np.nan_to_num(power / self.input_noise**2, nan=0.0).max(axis=1))
 
     def by_drive(self, at: Linearisation, motions: Sequence[tuple[Tensor, Tensor]], data: WindowBatch) -> list[Tensor]:
         """Contribution of each drive to the whitened signals, without free responses, each (B, F, R, W/2).

@@ -65,7 +65,7 @@ class Refined:
     error: FloatArray  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
     rms: FloatArray  # rms of measured, NaN for absent sensors, shape (B, S)
     states: FloatArray  # simulated, shape (B, T, N); T = 0 unless asked for
-    outputs: FloatArray  # simulated sensors, shape (B, T, S); T = 0 where states and values say them
+    outputs: FloatArray  # simulated sensors, shape (B, T, S); T = 0 unless asked for
     excitation: FloatArray  # power of the strongest input over that of its noise, shape (B,)
     weighed: BoolArray  # whether the next three were computed, shape (B,)
     cross: FloatArray  # change of the log-ratios per deviation, shape (B, P, H); H = 0 unless asked for
@@ -244,7 +244,7 @@ class Refiner:
     ) -> Refined:
         self._weigh_unconverged(data, progress, rows, wanted)
         x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
-        data = self.model.with_lost(x, data)
+        x0, data = self.model.settled(x, x0, data)
         identifiable, noise = self._identifiable(data, x, torch.diagonal(covariance, dim1=1, dim2=2).sqrt())
         signals = len(self.model.compression.matrix(data.present))
         freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
@@ -255,7 +255,16 @@ class Refiner:
         prior = torch.diag(1 / self.model.precision[: x.shape[1]])
         rms = np.full((len(x), len(data.present)), np.nan)
         rms[:, data.present] = data.measured.square().mean(dim=1).sqrt()
-        path = self.model.states(x, x0, data) if states else x0.new_zeros(len(x), 0, x0.shape[1])
+        path, shown = x0.new_zeros(len(x), 0, x0.shape[1]), x0.new_zeros(len(x), 0, len(data.present))
+        error = progress.error[rows]
+        if states or self.model.lost:
+            path, shown = self.model.simulated(x, x0, data)
+        if self.model.lost:  # the mean of a lost input is not told, and shifts all sensors
+            left = data.measured - shown[:, :, data.present]
+            shown[:, :, data.present] += left.mean(dim=1, keepdim=True)
+            error[:, data.present] = left.std(dim=1, correction=0)
+        if not states:
+            path, shown = path[:, :0], shown[:, :0]
         return Refined(
             log_ratio=torch.where(identifiable, x, torch.zeros_like(x)).numpy(),
             covariance=torch.where(both, covariance, prior).numpy(),
@@ -264,10 +273,10 @@ class Refiner:
             iterations=progress.iterations[rows].numpy(),
             chi_square=chi_square.numpy(),
             freedom=freedom.numpy(),
-            error=progress.error[rows].numpy(),
+            error=error.numpy(),
             rms=rms,
             states=path.numpy(),
-            outputs=np.zeros((len(x), 0, len(data.present))),
+            outputs=shown.numpy(),
             excitation=excitation,
             weighed=progress.weighed[rows].numpy(),
             cross=torch.where(identifiable[:, :, None], progress.cross[rows], 0.0).numpy(),

@@ -1,4 +1,4 @@
-"""Channels whose samples themselves show that they are frozen or saturated."""
+"""Channels whose samples themselves show that they are frozen, saturated or silent."""
 
 from __future__ import annotations
 
@@ -37,16 +37,22 @@ class StuckChannels:
                     break
         return tuple(found)
 
+    def silent(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
+        """Those of one window (T, C) of which nothing came."""
+        absent = np.flatnonzero(np.isnan(window).any(axis=0))
+        return tuple(MeasurementFault(self.names[column], "silent", 0.0) for column in absent)
+
     def all_inputs(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
-        """Whether all inputs of one window (T, C) are frozen although most sensors show that the vehicle runs: one
-        fault of them all, since what froze them is what they share.
+        """Whether all inputs of one window (T, C), of those that came, are frozen although most sensors show that the
+        vehicle runs: one fault of them all, since what froze them is what they share.
 
         At a standstill inputs may be as flat, where steps of the converter are coarse, but then sensors are quiet.
         """
-        flat = np.mean(np.diff(window[:, : self.inputs], axis=0) == 0, axis=0) > _FLAT
-        if self.inputs == 0 or not flat.all():
+        there = np.flatnonzero(np.isfinite(window[:, : self.inputs]).all(axis=0))
+        flat = np.mean(np.diff(window[:, there], axis=0) == 0, axis=0) > _FLAT
+        if len(there) == 0 or not flat.all():
             return ()
         moves = window[:, self.inputs :].std(axis=0) > _SHAKEN * self.noise  # one that is absent is NaN and does not
         if np.count_nonzero(moves) <= len(moves) / 2:
             return ()
-        return (MeasurementFault("|".join(self.names[: self.inputs]), "frozen", float(window[-1, 0])),)
+        return (MeasurementFault("|".join(self.names[c] for c in there), "frozen", float(window[-1, there[0]])),)

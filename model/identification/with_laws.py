@@ -66,7 +66,13 @@ def without_laws(system: System) -> System:
         name: element.model_copy(update={"laws": tuple(law for law in element.laws if set(law) <= of_structure)})
         for name, element in system.file.elements.items()
     }
-    return System(system.file.model_copy(update={"elements": bare}), system.catalogue, whole=True, as_drawn=True)
+    return System(
+        system.file.model_copy(update={"elements": bare}),
+        system.catalogue,
+        whole=True,
+        as_drawn=True,
+        lost=system.lost,
+    )
 
 
 class LawRefiner:

@@ -29,7 +29,7 @@ from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
 from sprung.model.tracking.weather import WeatherModel
 
-HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped")
+HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped", "silent")
 
 
 @dataclass(frozen=True, slots=True)
@@ -425,7 +425,7 @@ def counted(
     most: int,
     unseen: tuple[str, ...] | None = None,
 ) -> tuple[Stuck, ...]:
-    """Counts of frozen, saturated, reversed and exchanged channels after a window that found some.
+    """Counts of frozen, saturated, silent, reversed and exchanged channels after a window that found some.
 
     unseen: parameters that the window did not identify; None: it could not be used.
     """

@@ -57,7 +57,7 @@ class WindowBody(StrictBody):
     vehicle: VehicleId | None = None
     sample_rate: Annotated[Number, Field(gt=0, description="Hz; the system file's")]
     channels: dict[str, list[Number]] = Field(
-        description="samples by channel; a sensor may be missing, an input may not"
+        description="samples by channel; one may be missing, and what it alone determines is then not identifiable"
     )
     start: str | None = Field(
         default=None,
@@ -91,10 +91,10 @@ class WindowHead(StrictBody):
 
 
 def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]:
-    """The head of a `WindowBody` and its samples, shape (T, C), NaN for absent sensors.
+    """The head of a `WindowBody` and its samples, shape (T, C), NaN for absent channels.
 
     Costs milliseconds for any body within the limit, right or wrong: the first errors are told, then it stops.
-    Raises a 422 ApiProblem that names the fields: unknown channel, missing input, wrong length, wrong rate, no number.
+    Raises a 422 ApiProblem that names the fields: unknown channel, missing inputs, wrong length, wrong rate, no number.
     """
     raw = _object(content)
     wrong: list[dict[str, str]] = []
@@ -203,11 +203,11 @@ def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]], plac
         wrong += _faults(channels, names, system, place)
         if len(wrong) >= SHOWN_ERRORS:
             return values
-    wrong += [
-        _wrong(f"{place}channels.{channel.name}", "is missing; without every input nothing can be identified")
-        for channel in system.inputs
-        if channel.name not in channels
-    ][:SHOWN_ERRORS]
+    for some in system.needed:
+        if not some & channels.keys():
+            first = next(channel.name for channel in system.inputs if channel.name in some)
+            others = f", and so are {len(some) - 1} like it" if len(some) > 1 else ""
+            wrong.append(_wrong(f"{place}channels.{first}", f"is missing{others}; nothing can be identified without"))
     if not any(sensor in channels for sensor in system.sensors):
         wrong.append(_wrong(f"{place}channels", "hold no sensor; without any nothing can be identified"))
     return values

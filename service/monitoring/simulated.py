@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.signals import Estimate, FloatArray
+from sprung.model.signals import BoolArray, Estimate, FloatArray
 from sprung.service.errors import NotFound
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.ring import Excerpt
@@ -40,18 +40,18 @@ def unmeasured(engine: Engine) -> bool:
 
 
 def whole_windows(engine: Engine, excerpt: Excerpt | None) -> Iterator[tuple[int, FloatArray]]:
-    """Windows one after the other, oldest first, counted back from the newest sample; none with a missing input."""
+    """Windows one after the other, oldest first, counted back from the newest sample; channels with a gap are absent.
+    None without any sensor, or without what the system needs of its inputs."""
     if excerpt is None or unmeasured(engine):
         return
     length, inputs = engine.system.window, len(engine.system.inputs)
+    names = [channel.name for channel in engine.system.channels]
+    needed = [[names.index(name) for name in some] for some in engine.system.needed]
     for first in range(len(excerpt.values) % length, len(excerpt.values) - length + 1, length):
         values = excerpt.values[first : first + length]
-        present = np.isfinite(values)
-        sensors = present[:, inputs:]
-        if present[:, :inputs].all() and sensors.all(axis=0).any():
-            holed = sensors.any(axis=0) & ~sensors.all(axis=0)  # a sensor with a gap counts as absent
-            values = values.copy()
-            values[:, inputs:][:, holed] = np.nan
+        whole: BoolArray = np.asarray(np.isfinite(values).all(axis=0))
+        if whole[inputs:].any() and all(whole[columns].any() for columns in needed):
+            values = np.where(whole, values, np.nan)
             yield excerpt.start + round(first * NANOSECONDS / excerpt.sample_rate), values
 
 
@@ -64,32 +64,11 @@ def compare_all(engine: Engine, windows: Sequence[tuple[int, FloatArray]]) -> li
     """Identify windows, starts and values (T, C), at once and simulate their sensors; as `compare`."""
     if not windows:
         return []
-    import torch  # as the engine does: it takes a second
-
-    from sprung.model.simulate.linear import LinearSimulator
-
     values = np.stack([held for _, held in windows])  # shape (B, T, C)
     estimates, _ = engine.identify(values, states=True)
-    inputs = len(engine.system.inputs)
-    outputs = [estimate.outputs for estimate in estimates]
-    linear = [i for i, found in enumerate(outputs) if found is None]
-    if linear:
-        simulator = LinearSimulator(engine.system)
-        drives = torch.as_tensor(simulator.knots(values[linear, :, :inputs]))
-        ratios = np.stack([estimates[i].log_ratio for i in linear])
-        discrete = simulator.discretise(simulator.element_values(torch.as_tensor(ratios)))
-        states = torch.as_tensor(np.stack([_states(estimates[i]) for i in linear]))
-        found = states @ discrete.C.transpose(1, 2) + drives @ discrete.D.transpose(1, 2)
-        for i, simulated in zip(linear, found.numpy(), strict=True):
-            outputs[i] = simulated
-    rate = engine.system.sample_rate
+    inputs, rate = len(engine.system.inputs), engine.system.sample_rate
     return [
-        Compared(start, rate, held[:, inputs:], simulated, estimate)
-        for (start, held), simulated, estimate in zip(windows, outputs, estimates, strict=True)
-        if simulated is not None
+        Compared(start, rate, held[:, inputs:], estimate.outputs, estimate)
+        for (start, held), estimate in zip(windows, estimates, strict=True)
+        if estimate.outputs is not None
     ]
-
-
-def _states(estimate: Estimate) -> FloatArray:
-    assert estimate.states is not None
-    return estimate.states

@@ -134,6 +134,11 @@ def _parameter_families(entries: list[Entry]) -> Iterator[Metric]:
         "sprung_parameter_ratio_stddev", "Standard deviation of sprung_parameter_ratio", labels=labels
     )
     fit = GaugeMetricFamily("sprung_fit_nrmse", "rms(error) / rms(measured)", labels=["vehicle", "sensor"])
+    wrong = GaugeMetricFamily(
+        "sprung_sensor_fault",
+        "1 for what is wrong with a measurement; channels that share it are joined by |",
+        labels=["vehicle", "channel", "kind"],
+    )
     for entry in entries:
         view = entry.view
         for p in view.parameters:
@@ -144,4 +149,6 @@ def _parameter_families(entries: list[Entry]) -> Iterator[Metric]:
                 spread.add_metric([view.vehicle, p.element, p.quantity], p.drift_std)
         for sensor, nrmse in view.per_sensor.items():
             fit.add_metric([view.vehicle, sensor], nrmse)
-    yield from (*values.values(), ratio, spread, fit)
+        for fault in view.sensors:
+            wrong.add_metric([view.vehicle, fault.channel, fault.kind], 1)
+    yield from (*values.values(), ratio, spread, fit, wrong)

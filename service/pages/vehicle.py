@@ -117,17 +117,25 @@ def parameter_mark(p: ParameterView) -> Mark:
 
 
 def sensor_marks(system: System, view: VehicleView) -> dict[str, Mark]:
-    """How sensors are shown: suspect where an alarm says so, absent where the newest window had no samples."""
-    suspects = {channel for alarm in view.active if alarm.kind == "sensor" for channel in suspected(alarm)[0]}
+    """How sensors, and inputs that an alarm names, are shown: suspect where an alarm says so, absent where nothing is
+    received of them by an alarm or by the newest window."""
+    faults = [suspected(alarm) for alarm in view.active if alarm.kind == "sensor"]
+    silent = {channel for channels, fault in faults if fault == "silent" for channel in channels}
+    suspects = {channel for channels, _ in faults for channel in channels} - silent
     found = {}
     for name in system.sensors:
         if name in suspects:
             found[name] = Mark("suspect")
+        elif name in silent:
+            found[name] = Mark("absent")
         elif name in view.per_sensor:
             found[name] = Mark("ok")
         else:
             found[name] = Mark("absent" if view.per_sensor else "learning")
-    return found | {name: Mark("suspect") for name in sorted(suspects - found.keys())}  # measured inputs
+    inputs = {channel.name for channel in system.inputs}
+    return found | {
+        name: Mark("absent" if name in silent else "suspect") for name in sorted((suspects | silent) & inputs)
+    }
 
 
 def page_data(

@@ -121,12 +121,14 @@ def _sensors(sensors: Mapping[str, Mark], active: Sequence[AlarmRow]) -> list[Hi
     absent = [name for name, mark in sensors.items() if mark.state == "absent"]
     found = []
     if suspect:
-        faults = "".join(f"{_fault(a)}. " for a in active if a.kind == "sensor")
+        faults = "".join(f"{_fault(a)}. " for a in active if a.kind == "sensor" and suspected(a)[1] != "silent")
         text = "Check mounting, cable and scale; springs and dampers are judged without it where the others suffice."
         text = f"{faults}{text}"
         found.append(Hint("warning", f"Sensor suspect: {', '.join(suspect)}", text))
     if absent:
+        since = "".join(f"{_fault(a)}. " for a in active if a.kind == "sensor" and suspected(a)[1] == "silent")
         text = "Its channel delivers nothing, or its address in the system file is wrong: `sprung inspect` lists it."
+        text = f"{since}{text}"
         found.append(Hint("warning", f"No signal: {', '.join(absent[:4])}{' …' if len(absent) > 4 else ''}", text))
     return found
 
@@ -136,9 +138,10 @@ def _parameters(row: FleetRow, view: VehicleView, whole: int) -> list[Hint]:
     lost = [p for p in view.parameters if p.lost_with is not None]
     for channels in dict.fromkeys(p.lost_with for p in lost):
         names = ", ".join(p.name for p in lost if p.lost_with == channels)
+        are = "are" if "|" in str(channels) else "is"
         text = "Everything else is tracked, with the uncertainty that this leaves. Repair the sensor."
         found.append(
-            Hint("warning", f"Not identifiable while {str(channels).replace('|', ' and ')} is lost: {names}", text)
+            Hint("warning", f"Not identifiable while {str(channels).replace('|', ' and ')} {are} lost: {names}", text)
         )
     unknown = [p.name for p in view.parameters if p.state == "not_identifiable" and p.lost_with is None]
     if unknown and whole:

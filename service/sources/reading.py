@@ -82,7 +82,7 @@ def windower_of(system: System, stamped: bool = False) -> Windower:
         system.sample_rate,
         system.window,
         system.hop,
-        inputs=system.needed_inputs,
+        needed=system.needed,
         stamped=stamped,
     )
 

@@ -214,7 +214,7 @@ def test_a_measured_speed_is_used_and_a_missing_one_estimated() -> None:
     ride = draw_ride(rng)
     values = record(rng, ride, 30.0)
     system = parse_system(ACCELEROMETERS.read_text() + "\nspeed: {csv: v, unit: km/h, noise: 0.2}\n")
-    assert system.channels[0].name == "speed" and system.needed_inputs == 0
+    assert system.channels[0].name == "speed" and system.needed == ()
     identifier = AmbientIdentifier(system)
     stds = []
     for speed in (ride.speed, np.nan):

@@ -1,5 +1,5 @@
-"""Inputs that are lost: what they showed is left out of the likelihood, and everything else is identified as well as
-its deviation says."""
+"""Inputs that are lost, or of which nothing comes: what they showed is left out of the likelihood, and everything else
+is identified as well as its deviation says."""
 
 from __future__ import annotations
 
@@ -116,9 +116,12 @@ def followed(
     return state
 
 
-@pytest.mark.parametrize("at", [None, pytest.param(4.0, marks=pytest.mark.slow)])
-def test_a_vehicle_stays_monitored_while_a_wheel_is_frozen(at: float | None) -> None:
-    """At its mean or far off: the wheel is named, a damper of the other bogie found, and nothing else accused."""
+@pytest.mark.parametrize(
+    ("at", "kind"), [(None, "frozen"), (np.nan, "silent"), pytest.param(4.0, "frozen", marks=pytest.mark.slow)]
+)
+def test_a_vehicle_stays_monitored_while_a_wheel_is_lost(at: float | None, kind: str) -> None:
+    """Frozen at its mean, far off, or silent: the wheel is named, a damper of the other bogie found, and nothing else
+    accused."""
     system, rng = load_system(), np.random.default_rng(5)
     identifier, tracker = Identifier(system), Tracker(system.parameters, TrackerSettings(), deviations(system))
     names = [p.name for p in system.parameters]
@@ -135,7 +138,7 @@ def test_a_vehicle_stays_monitored_while_a_wheel_is_frozen(at: float | None) -> 
     state = followed(tracker, identifier, state, frozen(system, ride(weak, 80), WHEEL, at), 80)
 
     kinds = {(a.kind, a.parameter) for a in state.alarms}
-    assert kinds == {("change", "primary_22l.damping"), *(("sensor", f"{channel}.frozen") for channel in WHEEL)}
+    assert kinds == {("change", "primary_22l.damping"), *(("sensor", f"{channel}.{kind}") for channel in WHEEL)}
     assert state.coverage.monitored
     report = {r.name: r for r in tracker.report(state)}
     assert {name for name, r in report.items() if not r.identifiable} == ON_IT
@@ -149,9 +152,73 @@ def test_a_vehicle_stays_monitored_while_a_wheel_is_frozen(at: float | None) -> 
     assert abs(change.drift + 0.25) < 3 * change.drift_std
     state = TrackerState.from_dict(state.to_dict())
 
+    assert {(f.channel, f.kind) for f in tracker.sensors(state)} == {(channel, kind) for channel in WHEEL}
     state = followed(tracker, identifier, state, ride(weak, 40), 160)  # repaired
     assert {(a.kind, a.parameter) for a in state.active} == {("change", "primary_22l.damping")}
     assert {(a.kind, a.parameter) for a in state.alarms} == kinds
     assert not tracker.lost(state)
     level, std = tracker.posterior(state)
     assert np.abs((level - weak) / std).max() < 3
+
+
+def test_windows_are_refined_with_the_inputs_that_each_of_them_has() -> None:
+    """The same as if windows that lack the same were refined alone."""
+    system, values, _ = drawn("manchester.yaml")
+    mixed = values[:6].copy()
+    mixed[1, :, 2:4] = np.nan
+    mixed[4, :, 2:4] = np.nan
+    mixed[3, :, [10, 20]] = np.nan  # an input and a sensor
+    identifier = Identifier(system)
+    found = identifier.identify(mixed, states=True)
+    for rows in ([0, 2, 5], [1, 4], [3]):
+        alone = identifier.identify(mixed[rows], states=True)
+        for row, other in zip(rows, alone, strict=True):
+            np.testing.assert_allclose(found[row].log_ratio, other.log_ratio, atol=1e-9)
+            np.testing.assert_allclose(found[row].outputs, other.outputs, atol=1e-6)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found[1].log_ratio, without(system, values[1:2], WHEEL).log_ratio[0], atol=1e-3)
+    shown = np.asarray(found[1].outputs)
+    noise = np.array([channel.noise for channel in system.channels[16:]])
+    assert np.all(
+        (shown - values[1, :, 16:]).std(axis=0) < 12 * noise
+    )  # with the motion that the sensors tell, within the band
+
+
+def test_a_contradiction_is_found_in_windows_that_lack_an_input() -> None:
+    """A reversed sensor beside a silent wheel: both are named, and the window is used."""
+    system, values, truth = drawn("manchester.yaml")
+    wrong = values[:4].copy()
+    wrong[..., 20] *= -1
+    wrong[..., 2:4] = np.nan
+    found = Identifier(system).examine(wrong, np.ones(4, dtype=bool))
+    seen = np.array([p.name not in ON_IT for p in system.parameters])
+    for estimate, true in zip(found, truth, strict=False):
+        assert {(f.channel, f.kind) for f in estimate.faults} == {
+            (system.channels[20].name, "inverted"),
+            *((channel, "silent") for channel in WHEEL),
+        }
+        assert estimate.adequate
+        std = np.sqrt(np.diag(estimate.covariance))
+        assert np.all(
+            np.abs(estimate.log_ratio - true)[seen & estimate.identifiable] < 4.5 * std[seen & estimate.identifiable]
+        )
+
+
+def test_a_gain_is_found_in_windows_that_lack_an_input() -> None:
+    system, values, _ = drawn("manchester.yaml")
+    wrong = values[:4].copy()
+    wrong[..., 22] *= 1.2
+    wrong[..., 2:4] = np.nan
+    for estimate in Identifier(system).examine(wrong, np.ones(4, dtype=bool)):
+        gains = [f for f in estimate.faults if f.kind == "gain"]
+        assert [f.channel for f in gains] == [system.channels[22].name]
+        assert gains[0].value == pytest.approx(1.2, abs=0.06)
+        assert estimate.adequate
+
+
+def test_the_stated_misfit_of_a_window_without_an_input_is_that_of_what_the_sensors_leave() -> None:
+    system, values, _ = drawn("manchester.yaml")
+    silent = values[:6].copy()
+    silent[:, :, 2:4] = np.nan
+    for lossy, whole in zip(Identifier(system).identify(silent), Identifier(system).identify(values[:6]), strict=True):
+        assert lossy.nrmse < 3 * whole.nrmse
+        assert np.all(lossy.per_sensor < whole.per_sensor + 0.12)  # beyond the band nothing is told of a lost input

@@ -140,12 +140,21 @@ def test_a_window_that_does_not_fit_says_so(vehicle: tuple[System, FloatArray, R
     assert fits == [False, False, True, True]
 
 
-def test_a_missing_input_is_refused_by_name(vehicle: tuple[System, FloatArray, Runs]) -> None:
+def test_a_window_without_any_input_has_no_values_and_says_why(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, _, runs = vehicle
-    windows = runs.values[:1].copy()
-    windows[0, 7, 3] = np.nan
+    identifier = Identifier(system)
+    for ask in (identifier.identify, lambda w: identifier.examine(w, np.ones(len(w), dtype=bool))):
+        windows = runs.values[:3].copy()
+        windows[1, :, :16] = np.nan
+        found = ask(windows)
+        assert [e.identified for e in found] == [True, False, True]
+        assert found[1].reason == "missing input wheel_11l.displacement and 15 more"
+        assert not found[1].identifiable.any()
+        alone = ask(runs.values[:3][[0, 2]])
+        np.testing.assert_array_equal([found[0].log_ratio, found[2].log_ratio], [e.log_ratio for e in alone])
+    windows[0, 7, 3] = np.inf
     with pytest.raises(UnusableWindow, match=r"wheel_11r\.velocity"):
-        Identifier(system).identify(windows)
+        identifier.identify(windows)
 
 
 def test_states_are_the_simulated_ones(vehicle: tuple[System, FloatArray, Runs]) -> None:

@@ -110,11 +110,24 @@ def test_a_window_at_standstill_is_uninformative() -> None:
         assert not estimate.informative
 
 
-def test_a_missing_input_and_a_wrong_shape_are_named(windows: np.ndarray) -> None:
-    broken = windows[:1].copy()
-    broken[0, 3, 1] = np.nan
-    with pytest.raises(UnusableWindow, match=r"road\.velocity"):
-        load_identifier(strut(FRICTION)).identify(broken)
+@pytest.mark.parametrize("silent", [0, 1])
+def test_a_support_that_is_still_measured_is_enough(windows: np.ndarray, silent: int) -> None:
+    """Displacement or velocity alone says where it is; a window without either says why it has no values."""
+    truth = np.log([1.0, 22 / 20, 14 / 15, 60 / 50])
+    some = windows.copy()
+    some[:, :, silent] = np.nan
+    some[3, :, :2] = np.nan
+    estimates = load_identifier(strut(FRICTION)).examine(some, np.ones(len(some), dtype=bool))
+    without = estimates.pop(3)
+    assert (without.identified, without.reason) == (False, "missing input road.displacement and 1 more")
+    assert {f.kind for e in estimates for f in e.faults} == {"silent"}
+    fitting = [e for e in estimates if e.adequate]
+    assert len(fitting) > 0.9 * len(estimates)
+    errors = np.array([(e.log_ratio - truth) / np.sqrt(np.diag(e.covariance)) for e in fitting])
+    assert np.mean(np.abs(errors) < 3) > 0.95 and 0.5 < np.sqrt(np.mean(errors**2)) < 1.5
+
+
+def test_a_wrong_shape_is_named(windows: np.ndarray) -> None:
     with pytest.raises(UnusableWindow, match="shape"):
         load_identifier(strut(FRICTION)).identify(windows[:, :, :4])
 

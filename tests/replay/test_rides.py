@@ -21,7 +21,7 @@ SECONDS = 30
 
 def windows_of(path: Path, system: System) -> tuple[Recording, Windower, list[Window]]:
     recording = open_recording(path, system.channels, dbc=MANCHESTER_DBC)
-    windower = Windower(system.channels, 100.0, 100, 50, inputs=16)
+    windower = Windower(system.channels, 100.0, 100, 50, needed=system.needed)
     windows = [w for block in recording.blocks() for w in windower.push(block)] + windower.flush()
     return recording, windower, windows
 

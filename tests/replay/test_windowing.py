@@ -43,7 +43,7 @@ def even(seconds: float = 4.0, rate: float = RATE, channels: int = 3) -> list[Fl
 
 
 def windows_of(block: SampleBlock, **options: Any) -> tuple[Windower, list[Window]]:
-    windower = Windower(CHANNELS, RATE, 100, 50, inputs=1, **options)
+    windower = Windower(CHANNELS, RATE, 100, 50, needed=[frozenset({"road"})], **options)
     return windower, windower.push(block) + windower.flush()
 
 
@@ -104,7 +104,7 @@ def test_windows_do_not_depend_on_how_samples_are_cut_into_blocks() -> None:
     assert {w.outcome for w in whole} >= {"repaired"}
     for _ in range(5):
         ends = np.sort(rng.choice(len(block.time), 40, replace=False)).tolist()
-        windower = Windower(CHANNELS, RATE, 100, 50, inputs=1)
+        windower = Windower(CHANNELS, RATE, 100, 50, needed=[frozenset({"road"})])
         parts = [w for piece in cut(block, ends) for w in windower.push(piece)] + windower.flush()
         assert len(parts) == len(whole)
         assert all(same(a, b) for a, b in zip(parts, whole, strict=True))
@@ -220,6 +220,18 @@ def test_too_many_lost_samples_drop_a_window() -> None:
     assert windows[-1].outcome == "used"
 
 
+def test_a_channel_with_a_loose_contact_is_absent_and_costs_no_window() -> None:
+    """It sends for 0.3 s, then not for 0.3 s."""
+    block = stream(even())
+    row = np.rint((block.time - START) / 1e7).astype(int)
+    torn = without(block, (block.channel == 2) & (row % 60 < 30))
+    _, windows = windows_of(torn)
+    assert {(w.outcome, w.reason) for w in windows} == {("repaired", "gaps in axle")}
+    assert all(np.isnan(w.values[:, 2]).all() and np.isfinite(w.values[:, :2]).all() for w in windows)
+    everything = without(block, row % 60 < 30)
+    assert {w.outcome for w in windows_of(everything)[1]} == {"dropped"}
+
+
 def test_an_absent_sensor_is_a_nan_column_and_an_absent_input_drops_the_window() -> None:
     block = stream(even())
     _, windows = windows_of(without(block, block.channel == 2))
@@ -314,7 +326,7 @@ def test_a_long_recording_takes_little_time_and_memory_stays_bounded() -> None:
     block = SampleBlock(
         np.repeat(START + rows * 10_000_000, 28), np.tile(np.arange(28, dtype=np.int32), 60_000), np.ones(28 * 60_000)
     )
-    windower = Windower(channels, RATE, 100, 50, inputs=16)
+    windower = Windower(channels, RATE, 100, 50)
     begun = time.process_time()
     count, most = 0, 0
     for first in range(0, len(block.time), 28_000):

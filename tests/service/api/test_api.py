@@ -142,10 +142,18 @@ def test_a_wrong_body_is_refused_and_the_field_named(
         assert any(error["field"].startswith(field) for error in problem["errors"]), problem
 
 
-def test_a_missing_input_is_refused_by_name(client: TestClient, body: dict[str, Any]) -> None:
-    del body["channels"]["wheel_11l.displacement"]
+def test_a_window_without_some_inputs_is_identified_and_one_without_any_refused_by_name(
+    client: TestClient, body: dict[str, Any], system: System
+) -> None:
+    names = [channel.name for channel in system.inputs]
+    for name in names[2:]:
+        del body["channels"][name]
+    assert client.post("/identify", json=body).status_code == 200
+    for name in names[:2]:
+        del body["channels"][name]
     problem = refused(client.post("/identify", json=body), 422)
     assert problem["errors"][0]["field"] == "channels.wheel_11l.displacement"
+    assert "15 like it" in problem["errors"][0]["detail"]
 
 
 def test_inputs_without_any_sensor_are_refused(client: TestClient, body: dict[str, Any], system: System) -> None:

@@ -77,7 +77,7 @@ def test_an_element_is_said_to_be_unidentifiable_because_of_a_lost_input() -> No
     known = replace(spring, name="primary_11l.stiffness", element="primary_11l", identifiable=True, lost_with=None)
     (said,) = hints(ROW, replace(VIEW, alarms=(), parameters=(spring, known)), [], [], False, {})
     assert said.title == (
-        "Not identifiable while wheel_11r.displacement and wheel_11r.velocity is lost: primary_11r.stiffness"
+        "Not identifiable while wheel_11r.displacement and wheel_11r.velocity are lost: primary_11r.stiffness"
     )
     assert spring.as_dict()["lost_with"] == channels and spring.state == "not_identifiable"
     assert "lost_with" not in known.as_dict()
