@@ -31,8 +31,8 @@ class InnovationCusum:
 
     up: FloatArray
     down: FloatArray
-    score: FloatArray  # sum of the scores since the larger of the two left zero, shape (P,)
-    windows: FloatArray  # number of these, shape (P,)
+    score: FloatArray  # sum of the scores of the last windows on one side, at most since that left zero, shape (P,)
+    windows: FloatArray  # number of these, shape (P,): the last alone where it is more evidence than with those before
     offset: FloatArray  # mean of their residuals, shape (P,)
 
     def pending_variance(self, group: IntArray) -> FloatArray:
@@ -70,6 +70,8 @@ def update(
     down = np.maximum(0.0, cusum.down - score - idle)
     lost = np.maximum(up, down) >= THRESHOLD
     goes_on = (cusum.windows > 0) & (np.where(up >= down, cusum.score, -cusum.score) > 0)
+    # What chance had added up before a jump would hide how much its first window tells.
+    goes_on &= np.abs(score) * np.sqrt(cusum.windows + 1) < np.abs(cusum.score + score)
     sums = np.where(goes_on, [cusum.score, cusum.windows, cusum.offset], 0.0)
     windows = sums[1] + mask
     offset = sums[2] + np.where(mask, residual - sums[2], 0.0) / np.maximum(windows, 1.0)
