@@ -79,8 +79,10 @@ def _flat(content: Any, name: str = "", depth: int = 0) -> Iterator[Column]:
     except ValueError:  # rows of different lengths, or something else among numbers
         values = np.empty(len(content), dtype=object)
         values[:] = content
-    if values.dtype.kind == "O" and not any(isinstance(value, int | float) for value in values.ravel()):
-        return
+    if values.dtype.kind == "O":  # other things may be among numbers, not the other way round
+        numbers = sum(isinstance(value, int | float) for value in values.ravel())
+        if 2 * numbers < values.size:
+            return
     yield from of_array(name, values)
 
 

@@ -6,6 +6,7 @@ Layout: https://www.ceas3.uc.edu/sdrluff/ (Structural Dynamics Research Laborato
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -37,7 +38,7 @@ class _Function:
     clock: EvenTimes | None  # None: uneven, `times` holds them
     times: NDArray[np.float64] | None  # s
     values: NDArray[np.float64]
-    lacking: int  # values that are stated and not there
+    lacking: int  # values that are stated and not there, or are no numbers
 
 
 def columns(path: Path) -> list[Column]:
@@ -124,7 +125,10 @@ def _text(lines: list[bytes], body: bytes) -> NDArray[np.float64]:
         at = turn = 0
         while line[at:].strip():
             width = pattern[turn % len(pattern)]
-            out.append(float(line[at : at + width].replace(b"D", b"E")))
+            try:
+                out.append(float(line[at : at + width].replace(b"D", b"E")))
+            except ValueError:  # it costs itself: the file may end within a number
+                out.append(math.nan)
             at, turn = at + width, turn + 1
     return np.array(out)
 
@@ -158,9 +162,11 @@ def _function(lines: list[bytes], numbers: NDArray[np.float64]) -> _Function | N
         return None
     title, place, unit = _or_none(text[0].strip()) or "", _place(text[5]), _or_none(text[8][47:67].strip())
     if even:
-        return _Function(title, place, unit, _even_times(text), None, numbers[:count], max(0, count - len(numbers)))
+        lacking = count - np.isfinite(numbers[:count]).sum()
+        return _Function(title, place, unit, _even_times(text), None, numbers[:count], int(lacking))
     pairs = numbers[: min(2 * count, len(numbers) // 2 * 2)].reshape(-1, 2)
-    return _Function(title, place, unit, None, pairs[:, 0], pairs[:, 1], count - len(pairs))
+    lacking = count - np.isfinite(pairs).all(axis=1).sum()
+    return _Function(title, place, unit, None, pairs[:, 0], pairs[:, 1], int(lacking))
 
 
 def _is_time_response(text: list[str], kind: int) -> bool:

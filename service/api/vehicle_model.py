@@ -26,7 +26,7 @@ from sprung.service.store.vehicle_models import SERVICE_FILE, ModelVersion
 from sprung.service.times import optional_iso, to_iso
 
 router = APIRouter(tags=["operation"])
-MOST_CHARACTERS = 500_000  # of a system file
+MOST_CHARACTERS = 100_000  # of a system file: within what bodies may hold; the bundled one has 7 000
 
 
 GIVEN = {"report": "string", "version": "integer", "system": "string"}  # of which one says what to use

@@ -100,6 +100,8 @@ def damaged(record: int, first: int, text: str) -> bytes:
     [
         (damaged(8, 10, f"{10**9:10d}"), "states 999999700 more values than the file holds"),
         (uff58(7, -1, RIGHT, times=SECONDS) + uff58(12, 3, LEFT, times=SECONDS, binary="<")[:-900], "more values"),
+        (uff58(7, -1, RIGHT, times=SECONDS) + uff58(12, 3, LEFT, times=SECONDS)[:-907], "more values"),
+        (damaged(20, 3, "?"), "states 1 more values than the file holds"),
     ],
 )
 def test_universal_files_that_hold_less_than_they_state_are_incomplete(

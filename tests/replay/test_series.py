@@ -297,7 +297,7 @@ def test_universal_files_with_uneven_times_dates_and_other_functions(tmp_path: P
     (tmp_path / "c.uff").write_bytes(frf)
     with pytest.raises(UnreadableRecording, match="no time responses"):
         read(tmp_path / "c.uff", (x,))
-    (tmp_path / "d.uff").write_bytes(uff58(12, 3, VALUES[:, 0]).replace(b"E-01", b"E-x1"))
+    (tmp_path / "d.uff").write_bytes(uff58(12, 3, VALUES[:, 0]).replace(b"\n         4", b"\n         x"))
     with pytest.raises(UnreadableRecording, match="a damaged dataset 58"):
         read(tmp_path / "d.uff", (x,))
 

@@ -15,6 +15,7 @@ from scipy.signal import firwin
 from sqlalchemy import select
 
 from sprung.model.identification.identify import Identifier
+from sprung.service.api.vehicle_model import MOST_CHARACTERS
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Stage
@@ -209,6 +210,15 @@ def test_wrong_models_are_refused_in_one_line(client: TestClient, core: Core, ri
     assert client.post("/vehicles/a/model", json={"system": FOUND}).json()["in_use"] == 1
     assert client.request("DELETE", "/vehicles/a?confirm=a").status_code == 204
     assert client.get("/vehicles/a/models").status_code == 404
+
+
+def test_a_system_file_may_be_as_long_as_described(client: TestClient, core: Core) -> None:
+    """And no body that is described is beyond the limit of bodies."""
+    core.pipeline.process("a", [])
+    text = FOUND + "# a long history\n" * ((MOST_CHARACTERS - len(FOUND)) // 17)
+    assert client.post("/vehicles/a/model", json={"system": text}).status_code == 200
+    answer = client.post("/vehicles/a/model", json={"system": "a" * (MOST_CHARACTERS + 1)})
+    assert answer.status_code == 422 and answer.json()["errors"][0]["field"] == "system"
 
 
 def test_a_model_whose_windows_take_too_long_is_refused(
