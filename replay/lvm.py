@@ -78,22 +78,33 @@ def _of_segment(segment: _Segment, point: str, shape: str) -> Iterator[Column]:
     """The channels of a segment; shape: "one" column of times, "multi" (one beside every channel) or "no"."""
     names = [name for name in segment.names if name.lower() != "comment"]
     values = np.array([_numbers(row, len(names), point) for row in segment.rows])
+    wrong = np.isinf(values).sum(axis=0)  # cells that are no numbers, or none that could be measured
     timed = shape == "multi"
     channels = [i for i, name in enumerate(names) if not name.startswith("X_Value")]
     for order, i in enumerate(channels):
         series, clock = values[:, i], _clock(segment.header, order)
-        good = np.isfinite(series)
-        x = values[:, i - 1] if timed else values[:, 0]
-        if clock is None and shape != "no" and good.sum() > 1:
-            known = x[good]
-            clock = EvenTimes(round(float(known[0]) * SECOND), float(np.diff(known).mean()), True)
+        good = np.flatnonzero(np.isfinite(series))
+        series = np.where(np.isfinite(series), series, np.nan)[: good[-1] + 1 if len(good) else 0]  # shorter columns
+        x = (values[:, i - 1] if timed else values[:, 0])[good]
+        if clock is None and shape != "no" and len(good) > 1:
+            step = float((x[-1] - x[0]) / (good[-1] - good[0]))
+            clock = EvenTimes(round((float(x[0]) - int(good[0]) * step) * SECOND), step, True)
         unit = _at(segment.header.get("Y_Unit_Label", ()), order)
-        yield whole(names[i] or f"channel {order + 1}", series[good], unit, clock)
+        found = whole(names[i] or f"channel {order + 1}", series, unit, clock)
+        yield replace(found, lacking=int(wrong[i]))
 
 
 def _numbers(row: Sequence[str], count: int, point: str) -> list[float]:
     cells = [cell.strip().replace(point, ".") if point != "." else cell.strip() for cell in row[:count]]
-    return [float(cell) if cell else np.nan for cell in cells] + [np.nan] * (count - len(cells))
+    return [_number(cell) for cell in cells] + [np.nan] * (count - len(cells))
+
+
+def _number(cell: str) -> float:
+    """NaN for an empty cell, infinity for one that is no number."""
+    try:
+        return float(cell) if cell else np.nan
+    except ValueError:
+        return np.inf
 
 
 def _at(said: Sequence[str], place: int) -> str | None:

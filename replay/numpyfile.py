@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from sprung.replay.account import UnreadableRecording
@@ -24,11 +25,24 @@ def arrays(path: Path) -> Arrays:
                 check_whole(path, (one.file_size for one in packed.infolist()))
             with np.load(path, allow_pickle=False) as content:
                 for name in content.files:
-                    yield from _fields(name, content[name])
+                    found = _member(content, name)
+                    if found is not None:
+                        yield from _fields(name, found)
         else:
             yield from _fields("data", np.load(path, allow_pickle=False))
     except (ValueError, OSError, EOFError, KeyError, SyntaxError, zipfile.BadZipFile) as error:
         raise UnreadableRecording(f"{path}: not a NumPy file that can be read: {error}") from error
+
+
+def _member(content: NpzFile, name: str) -> NDArray[Any] | None:
+    """An array; None for what is none: notes beside the arrays, and pickled objects, which `np.savez` makes of them."""
+    try:
+        found = content[name]
+    except ValueError as error:
+        if "allow_pickle" in str(error):
+            return None
+        raise
+    return found if isinstance(found, np.ndarray) else None
 
 
 def _fields(name: str, values: NDArray[Any]) -> Arrays:

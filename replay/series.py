@@ -133,7 +133,7 @@ def _hdf5(path: Path) -> Iterator[list[Column]]:
         found: list[Column] = []
 
         def visit(name: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset) and not name.startswith("#"):
+            if isinstance(item, h5py.Dataset) and not name.startswith("#") and item.shape is not None:
                 _check_own(path, name, item)
                 found.extend(_checked(path, item, column) for column in _datasets(name, item))
 

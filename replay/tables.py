@@ -49,7 +49,7 @@ class Column:
     unit: str | None = None
     clock: EvenTimes | None = None
     sheet: int = 0  # of an array with more than two axes, from 0
-    lacking: int = 0  # values that the file states and does not hold
+    lacking: int = 0  # values that the file states and does not hold, or that are no numbers
 
     @property
     def group(self) -> str:
@@ -227,7 +227,7 @@ def column_blocks(
     for column in columns:
         account.contents[column.name] = column.length
         if column.lacking:
-            account.problem(f"{column.name} states {column.lacking} more values than the file holds")
+            account.problem(f"{column.name}: {column.lacking} of its values are not there, or are no numbers")
     found = find_columns(path, names, channels, account)
     check_samples(path, sum(columns[at].length for _, at in found))
     by_time: dict[Any, list[tuple[int, Column]]] = {}

@@ -27,7 +27,7 @@ from sprung.replay.clock_messages import remarks
 from sprung.replay.record import load_record
 from sprung.replay.windowing import Windower
 from tests.fuzz.mutate import INSIDE, mutant
-from tests.fuzz.seeds import CHECKED, GROUPED, SEEDS, START, TABLE, TIMES, UNIVERSAL, VALUES
+from tests.fuzz.seeds import CHECKED, GROUPED, RECORDS, SEEDS, START, TABLE, TIMES, UNIVERSAL, VALUES
 from tests.replay_files import database
 
 SECONDS = 20.0  # of processor time that one mutant may take
@@ -100,7 +100,7 @@ def read_one(path: Path, dbc: Any, honest: bool, outcome: MutantOutcome) -> None
     previous = signal.signal(signal.SIGPROF, _hang)
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
-        channels = {".tdms": GROUPED, ".uff": UNIVERSAL}.get(path.suffix, TABLE)
+        channels = {".tdms": GROUPED, ".uff": UNIVERSAL, ".npy": RECORDS}.get(path.suffix, TABLE)
         recording = open_recording(path, channels, dbc=dbc)
         blocks = list(recording.blocks())
         _windows(blocks)

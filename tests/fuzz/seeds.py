@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import scipy.io
 from mcap.writer import CompressionType
 
@@ -28,6 +29,7 @@ from tests.replay_files import (
 
 TABLE = [Channel(c.name, c.unit, c.noise, c.mcap, c.can, c.csv, column=c.csv) for c in CHANNELS]
 GROUPED = [Channel(c.name, c.unit, c.noise, column=f"group/{c.csv}") for c in CHANNELS]  # as TDMS names them
+RECORDS = [Channel(c.name, c.unit, c.noise, column=f"data.{c.csv}") for c in CHANNELS]  # of a structured array
 UNIVERSAL = [Channel(c.name, c.unit, c.noise, column=name) for c, name in zip(CHANNELS, ("12+Z", "7-X"), strict=True)]
 SECONDS: FloatArray = NUMBERS / 100
 COLUMNS: dict[str, FloatArray] = {"time": SECONDS, "left": LEFT, "right": RIGHT}
@@ -75,6 +77,22 @@ def _uff(path: Path) -> None:
     path.write_bytes(uff58(12, 3, LEFT, unit="m/s2", times=SECONDS) + uff58(7, -1, RIGHT, unit="m/s2", times=SECONDS))
 
 
+def _npz(path: Path) -> None:
+    np.savez_compressed(path, **COLUMNS)  # type: ignore[arg-type]
+
+
+def _npy(path: Path) -> None:
+    kinds = [(name, "f8") for name in COLUMNS]
+    np.save(path, np.array(list(zip(*COLUMNS.values(), strict=True)), dtype=kinds))
+
+
+def _lvm(path: Path) -> None:
+    head = ["LabVIEW Measurement\t", "Separator\tTab", "X_Columns\tOne", "***End_of_Header***\t", "Channels\t2"]
+    head += ["Delta_X\t0.01\t0.01", "X0\t0\t0", "***End_of_Header***\t", "X_Value\tleft\tright"]
+    rows = [f"{s:.2f}\t{x}\t{y}" for s, x, y in zip(SECONDS, LEFT, RIGHT, strict=True)]
+    path.write_text("\n".join([*head, *rows]) + "\n")
+
+
 def _tab(path: Path) -> None:
     rows = [f"{s:.2f}\t{x}\t{y}".replace(".", ",") for s, x, y in zip(SECONDS, LEFT, RIGHT, strict=True)]
     path.write_text("\n".join(["# made for tests", "time [s]\tleft\tright", *rows]) + "\n", encoding="cp1252")
@@ -99,8 +117,11 @@ SEEDS: dict[str, tuple[str, Callable[[Path], None]]] = {  # name -> file name, w
     "tdms": ("a.tdms", _tdms),
     "uff": ("a.uff", _uff),
     "mf4": ("a.mf4", write_can),
+    "npz": ("a.npz", _npz),
+    "npy": ("a.npy", _npy),
+    "lvm": ("a.lvm", _lvm),
 }
 CHECKED = ("mcap", "mcap-lz4", "mcap-plain", "blf")  # every sample is under a checksum that the reader verifies
 NEEDS = {"parquet": "pyarrow", "hdf5": "h5py", "tdms": "nptdms", "mf4": "asammdf"}  # optional packages
 
-__all__ = ["CHECKED", "GROUPED", "NEEDS", "SEEDS", "START", "TABLE", "TIMES", "UNIVERSAL", "VALUES"]
+__all__ = ["CHECKED", "GROUPED", "NEEDS", "RECORDS", "SEEDS", "START", "TABLE", "TIMES", "UNIVERSAL", "VALUES"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -98,10 +99,10 @@ def damaged(record: int, first: int, text: str) -> bytes:
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        (damaged(8, 10, f"{10**9:10d}"), "states 999999700 more values than the file holds"),
-        (uff58(7, -1, RIGHT, times=SECONDS) + uff58(12, 3, LEFT, times=SECONDS, binary="<")[:-900], "more values"),
-        (uff58(7, -1, RIGHT, times=SECONDS) + uff58(12, 3, LEFT, times=SECONDS)[:-907], "more values"),
-        (damaged(20, 3, "?"), "states 1 more values than the file holds"),
+        (damaged(8, 10, f"{10**9:10d}"), "999999700 of its values are not there"),
+        (uff58(7, -1, RIGHT, times=SECONDS) + uff58(12, 3, LEFT, times=SECONDS, binary="<")[:-900], "are not there"),
+        (uff58(7, -1, RIGHT, times=SECONDS) + uff58(12, 3, LEFT, times=SECONDS)[:-907], "are not there"),
+        (damaged(20, 3, "?"), "1 of its values are not there"),
     ],
 )
 def test_universal_files_that_hold_less_than_they_state_are_incomplete(
@@ -151,3 +152,43 @@ def test_complex_numbers_of_tdms_are_no_samples(tmp_path: Path) -> None:
     assert np.isnan(samples[0][1]).all()  # what is real of them would be taken for it
     assert "group/left: 300 of its values are no numbers, and taken as missing" in recording.problems
     assert samples[1][1].tolist() == RIGHT.tolist()
+
+
+LVM = (
+    "LabVIEW Measurement\t\nSeparator\tTab\nX_Columns\t{x}\n***End_of_Header***\t\nChannels\t2\n{clock}"
+    "***End_of_Header***\t\nX_Value\tleft\tright\n"
+)
+
+
+@pytest.mark.parametrize("clock", ["", "Delta_X\t0.01\t0.01\nX0\t0\t0\n"])
+@pytest.mark.parametrize(("bad", "reported"), [("", False), ("x", True), ("inf", True)])
+def test_a_cell_of_labview_that_is_no_number_costs_itself(clock: str, bad: str, reported: bool, tmp_path: Path) -> None:
+    """What comes after it keeps its time."""
+    rows = [f"{i / 100}\t{i % 7}\t{i % 5}" for i in range(ROWS)]
+    rows[0], rows[BAD], rows[-1] = f"0\t{bad}\t0", f"{BAD / 100}\t{bad}\t0", f"{(ROWS - 1) / 100}\t\t4"
+    (tmp_path / "a.lvm").write_text(LVM.format(x="One", clock=clock) + "\n".join(rows) + "\n")
+    recording, samples = read(tmp_path / "a.lvm", channels=TABLE)
+    times, values = samples[0]
+    known = ~np.isnan(values)
+    assert times[known].tolist() == [i * 10**7 for i in range(ROWS) if i not in (0, BAD, ROWS - 1)]
+    assert values[known].tolist() == [i % 7 for i in range(ROWS) if i not in (0, BAD, ROWS - 1)]
+    assert recording.incomplete == reported
+
+
+def test_notes_beside_arrays_cost_only_themselves(tmp_path: Path) -> None:
+    """Pickled objects are never read, and neither stops others from being."""
+    np.savez(tmp_path / "a.npz", time=SECONDS, left=LEFT, right=RIGHT, about=np.array({"by": "us"}, dtype=object))
+    with zipfile.ZipFile(tmp_path / "a.npz", "a") as packed:
+        packed.writestr("readme.txt", "hello")
+    _, samples = read(tmp_path / "a.npz", channels=TABLE)
+    assert samples[0][1].tolist() == LEFT.tolist()
+
+
+def test_an_empty_dataset_costs_only_itself(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, values in {"time": SECONDS, "left": LEFT, "right": RIGHT}.items():
+            file[name] = values
+        file["nothing"] = h5py.Empty("f8")
+    _, samples = read(tmp_path / "a.h5", channels=TABLE)
+    assert samples[0][1].tolist() == LEFT.tolist()
