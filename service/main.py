@@ -70,7 +70,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         core = build_core(settings, engine, following)
         stack.callback(core.close)
         notice = access_notice(settings, core.tokens.any or core.oidc is not None)
-        core.feeds += [live_feed(core, text, feeds.vehicle) for text in feeds.buses]  # notices look at this list
+        add_live_feeds(core, feeds)
         files = threading.Thread(target=_feed_files, args=(core, feeds, watch), daemon=True)
 
         def start() -> None:
@@ -144,6 +144,11 @@ def _listen(settings: Settings) -> socket.socket:
     except OSError as error:
         detail = error.strerror or error
         raise UserError(f"cannot listen on {settings.host}:{settings.port}: {detail}; choose another --port") from error
+
+
+def add_live_feeds(core: Core, feeds: Feeds) -> None:
+    """Every bus, into the list that health, metrics and notifications look at.  Raises UserError."""
+    core.feeds += [live_feed(core, text, feeds.vehicle) for text in feeds.buses]
 
 
 def live_feed(core: Core, text: str, vehicle: str | None) -> LiveFeed:

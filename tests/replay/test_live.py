@@ -1,5 +1,6 @@
 """A bus is read as it runs, lost and found again; a recording can be played onto one."""
 
+import socket
 import threading
 import time
 from collections import Counter
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import can
+import msgpack
 import numpy as np
 import pytest
 from cantools.database.can import Database, Message, Signal
@@ -180,8 +182,10 @@ def test_playing_can_be_scaled_and_stopped(dbc: Path, bus_name: str, tmp_path: P
         send(tmp_path / "run.log", "virtual", bus_name, speed=0.0)
 
 
-def test_udp_multicast_carries_frames_between_buses(dbc: Path) -> None:
-    group: dict[str, Any] = {"interface": "udp_multicast", "channel": "239.74.163.7", "port": 43219}
+@pytest.fixture
+def group() -> dict[str, Any]:
+    """A multicast group that works here."""
+    group: dict[str, Any] = {"interface": "udp_multicast", "channel": "239.74.163.7", "port": 43219 + next(NUMBERS)}
     try:
         with can.Bus(**group) as probe, can.Bus(**group) as other:
             other.send(frame(1))
@@ -190,6 +194,36 @@ def test_udp_multicast_carries_frames_between_buses(dbc: Path) -> None:
         pytest.skip(f"no multicast here: {error}")
     if reached is None:
         pytest.skip("no multicast here")
+    return group
+
+
+def test_datagrams_that_are_no_frames_cost_themselves(dbc: Path, group: dict[str, Any]) -> None:
+    """Whoever reaches the group can send them: they neither close the bus nor end its reader."""
+
+    def packed(**wrong: Any) -> bytes:
+        fields = {"arbitration_id": 0x123, "is_extended_id": False, "dlc": 8, "data": bytes(8)} | wrong
+        content: bytes = msgpack.packb(fields)
+        return content
+
+    strange = [b"", b"hello", bytes(range(256)) * 16, packed(data=1 << 62), packed(arbitration_id="x"), packed(x=1)]
+    strange += [packed(arbitration_id=291.0), packed(data=b"a" * 70), msgpack.packb([1]), b"\xdd" * 5]
+    strange += [packed(arbitration_id=-1), packed(data=[300]), packed(data="x"), msgpack.packb({1: 2}), b"\x91" * 2000]
+    live = LiveBus("udp_multicast", group["channel"], [CHANNEL], dbc, port=group["port"])
+    listener = CollectingListener(live)
+    assert listener.wait(lambda: live.connected)
+    with can.Bus(**group) as sender, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for value in range(5):
+            for datagram in strange:
+                stranger.sendto(datagram, (group["channel"], group["port"]))
+            sender.send(frame(value))
+        assert listener.wait(lambda: len(listener.values()) >= 5)
+    listener.stop()
+    assert sorted(listener.values()) == [0, 1, 2, 3, 4]
+    assert (live.reconnects, live.problems) == (0, [])
+    assert live.tally.corrupt >= 5 * (len(strange) - 2)  # python-can may take some for frames of other ids
+
+
+def test_udp_multicast_carries_frames_between_buses(dbc: Path, group: dict[str, Any]) -> None:
     live = LiveBus("udp_multicast", group["channel"], [CHANNEL], dbc, port=group["port"])
     listener = CollectingListener(live)
     assert listener.wait(lambda: live.connected)

@@ -6,8 +6,10 @@ import base64
 import hashlib
 import hmac
 import json
+import socket
 import socketserver
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -22,12 +24,14 @@ from sprung.model.tracking.state import Alarm
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.errors import UserError
+from sprung.service.main import Feeds, add_live_feeds
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.views import changed_part, spoken
 from sprung.service.notify.events import alarm_event, sentence
-from sprung.service.notify.notices import PAUSES, Notices
+from sprung.service.notify.notices import AT_ONCE, PAUSES, Notices
 from sprung.service.notify.senders import signature
 from sprung.service.settings import Settings
+from sprung.service.sources.live import FeedStatus
 from sprung.service.store import Store
 from sprung.service.store.fleet import AlarmChange
 from sprung.service.store.lists import list_deliveries
@@ -203,6 +207,71 @@ def test_a_lost_bus_is_reported_once_and_told_when_it_is_back(tmp_path: Path, st
     with store.read() as connection:
         kinds = sorted(row.kind for row in list_deliveries(connection, 10))
     assert kinds == ["sprung.feed.found", "sprung.feed.lost"]
+
+
+def test_a_served_bus_that_is_lost_is_reported(engine: Engine, data_dir: Path) -> None:
+    """By what `sprung serve` wires, with a bus that is not there."""
+    settings = Settings(data_dir=data_dir, webhooks=("http://127.0.0.1:1/",), webhook_networks=("127.0.0.0/8",))
+    core = build_core(settings, engine)
+    add_live_feeds(core, Feeds(buses=("socketcan:absent0",), vehicle="car-17"))
+    core.notices.watch_feeds()
+    with core.store.read() as connection:
+        assert [row.kind for row in list_deliveries(connection, 10)] == ["sprung.feed.lost"]
+    core.close()
+
+
+def test_what_cannot_be_written_down_is_reported_later(tmp_path: Path, store: Store) -> None:
+    feed = FeedStatus("socketcan:can0", "car-17", "down", "no such device", 0.0, 0, 0, 0, 0, 0)
+    settings = Settings(data_dir=tmp_path, webhooks=("http://127.0.0.1:1/",), webhook_networks=("127.0.0.0/8",))
+    notices = Notices(settings, store, lambda: [feed])
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(store, "write", failing)
+        with pytest.raises(OSError):
+            notices.watch_feeds()
+    notices.watch_feeds()
+    with store.read() as connection:
+        assert [row.kind for row in list_deliveries(connection, 10)] == ["sprung.feed.lost"]
+
+
+def failing() -> None:
+    raise OSError("database is locked")
+
+
+def test_a_receiver_that_never_answers_holds_others_up_once(
+    tmp_path: Path, store: Store, receiver: str, received: Received, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not with every event that waits for it, and not for ever where many do."""
+    monkeypatch.setattr("sprung.service.notify.senders.SECONDS", 0.5)
+    monkeypatch.setattr("sprung.service.notify.notices.TURN_SECONDS", 0.2)
+    with socket.create_server(("127.0.0.1", 0), backlog=100) as silent:
+        slow = f"http://127.0.0.1:{silent.getsockname()[1]}/"
+        settings = Settings(data_dir=tmp_path, webhooks=(slow, receiver), webhook_networks=("127.0.0.0/8",))
+        notices = Notices(settings, store)
+        with store.write() as connection:
+            for number in range(AT_ONCE + 10):
+                notices.report(connection, "car-17", f"r{number}", {"verdict": "none"})
+        begun, arrived = time.monotonic(), 0
+        while arrived < AT_ONCE + 10:
+            arrived += notices.deliver(now_ns())
+            assert time.monotonic() - begun < 20.0  # of half a minute that all attempts would take
+    assert len(received.requests) == AT_ONCE + 10
+
+
+def test_what_cannot_be_sent_at_all_holds_up_nothing(
+    core: Core, system: System, received: Received, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the reason: it counts as an attempt, and the thread goes on."""
+    alarm(core, system)
+    monkeypatch.setattr("sprung.service.notify.senders.post", lambda *_: {}["nothing"])
+    assert core.notices.deliver(now_ns()) == 0
+    monkeypatch.undo()
+    assert core.notices.deliver(now_ns() + 6 * NANOSECONDS) > 0
+
+
+@pytest.mark.parametrize("secret", ["whsec_$$$", "whsec_abc"])
+def test_a_secret_that_is_none_is_refused_at_the_start(tmp_path: Path, store: Store, secret: str) -> None:
+    with pytest.raises(UserError, match="SPRUNG_WEBHOOK_SECRET"):
+        Notices(Settings(data_dir=tmp_path, webhook_secret=secret), store)
 
 
 @pytest.mark.parametrize(
