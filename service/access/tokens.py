@@ -11,7 +11,7 @@ import hmac
 import secrets
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -51,6 +51,15 @@ class Refused(Exception):
     """A token that is no good; the message says why."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Session:
+    """Of somebody who signed in."""
+
+    ends: float  # time.monotonic()
+    owner: Callable[[], Actor]
+    name: str
+
+
 class Tokens:
     """Safe to share between threads."""
 
@@ -60,7 +69,7 @@ class Tokens:
         self._admin = None if admin_token is None else digest_of(admin_token)
         self._clock = clock
         self._known: OrderedDict[str, tuple[float, TokenRow | None]] = OrderedDict()
-        self._sessions: OrderedDict[str, tuple[float, Callable[[], Actor]]] = OrderedDict()
+        self._sessions: dict[str, _Session] = {}  # by digest, the oldest first
         self._counted: tuple[float, bool] = (-1e9, False)
         self._lock = threading.Lock()
 
@@ -141,15 +150,19 @@ class Tokens:
     def sign_in(self, text: str) -> tuple[str, Actor]:
         """A session of the token's owner, that ends with the token, and who that is.  Raises Refused."""
         actor = self.actor(text)
-        return self.open_session(lambda: self.actor(text), SESSION_SECONDS), actor
+        return self.open_session(lambda: self.actor(text), SESSION_SECONDS, actor.name), actor
 
-    def open_session(self, owner: Callable[[], Actor], seconds: float) -> str:
-        """A session; `owner` is asked with each request and may raise Refused."""
+    def open_session(self, owner: Callable[[], Actor], seconds: float, name: str) -> str:
+        """A session; `owner` is asked with each request and may raise Refused.
+
+        When there are too many, who has most of them by `name` loses the oldest: nobody signs others out.
+        """
         session = secrets.token_urlsafe(32)
         with self._lock:
-            self._sessions[digest_of(session)] = (time.monotonic() + seconds, owner)
-            while len(self._sessions) > MOST_SESSIONS:
-                self._sessions.popitem(last=False)
+            self._sessions[digest_of(session)] = _Session(time.monotonic() + seconds, owner, name)
+            if len(self._sessions) > MOST_SESSIONS:
+                greedy = Counter(one.name for one in self._sessions.values()).most_common(1)[0][0]
+                del self._sessions[next(key for key, one in self._sessions.items() if one.name == greedy)]
         return session
 
     def sign_out(self, session: str) -> Actor | None:
@@ -165,10 +178,10 @@ class Tokens:
     def session(self, session: str) -> Actor:
         """Whose session it is; ends with its token.  Raises Refused."""
         with self._lock:
-            ends, owner = self._sessions.get(digest_of(session), (0.0, Actor))
-        if ends < time.monotonic():
+            found = self._sessions.get(digest_of(session))
+        if found is None or found.ends < time.monotonic():
             raise Refused("the session is over; sign in again")
-        return owner()
+        return found.owner()
 
     def _valid(self, row: TokenRow) -> Actor:
         if row.revoked_ns is not None:

@@ -447,3 +447,14 @@ def test_a_message_of_several_lines_is_one_line_for_people() -> None:
         "args": ("disk is full\n[SQL: x]\nsee",),
     }
     assert PlainLines().format(logging.makeLogRecord(told)) == "sprung: ERROR: disk is full [SQL: x] see"
+
+
+def test_who_signs_in_too_often_signs_out_nobody_else(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sprung.service.access.tokens.MOST_SESSIONS", 20)
+    greedy, other = (core.tokens.create(name, ["read"])[0] for name in ("greedy", "other"))
+    mine, _ = core.tokens.sign_in(other)
+    theirs = [core.tokens.sign_in(greedy)[0] for _ in range(50)]
+    assert core.tokens.session(mine).name == "other"
+    assert core.tokens.session(theirs[-1]).name == "greedy"
+    with pytest.raises(Refused):
+        core.tokens.session(theirs[0])

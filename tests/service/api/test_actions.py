@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from mcap.reader import make_reader
-from sqlalchemy import select
+from sqlalchemy import String, Text, select
 
 from sprung.model.system import System, parse_system
 from sprung.service.api import signals
@@ -23,10 +23,10 @@ from sprung.service.core import Core, build_core
 from sprung.service.monitoring.engine import Engine
 from sprung.service.rendering.drawing import Mark, columns, plan_view, side_view, small_view
 from sprung.service.settings import Settings
-from sprung.service.store import retention, work
+from sprung.service.store import outbox, retention, work
 from sprung.service.store.schema import audit, metadata
 from sprung.service.times import from_iso
-from tests.service_fakes import START, FakeIdentifier, make_window
+from tests.service_fakes import REPORT, START, FakeIdentifier, make_window
 
 
 def deeds(core: Core) -> list[str]:
@@ -368,3 +368,36 @@ def test_what_stands_above_each_other_hides_no_name(system: System) -> None:
 def test_the_worst_of_a_place_is_seen_in_the_list(letters: str) -> None:
     quarter = parse_system(QUARTER.split("```")[0])
     assert re.findall(r'"dot (\w+)"', small_view(quarter, columns(quarter), letters)) == ["ok", "alarm"]
+
+
+STATES = {"state", "kind", "severity", "health", "source", "verdict", "name", "digest", "fleet"}  # are compared
+
+
+def test_no_text_in_the_store_becomes_markup(client: TestClient, core: Core, broken: str) -> None:
+    """Whatever way it came in: every column of text that is neither a key nor one of a few words holds some."""
+    evil = "<img src=x onerror=alert(1)>\"'"
+    client.post("/vehicles/a/notes", json={"text": "x"})
+    client.post("/vehicles/a/maintenance", json={"text": "x", "parameters": ["secondary_2l.damping"]})
+    token = core.tokens.create("x", ["read"])[0]
+    with core.store.write() as connection:
+        recording = work.RecordingRow("r", "a", "x", "upload", None, 1, None, START, None)
+        work.add_recording(connection, recording)
+        for state in ("failed", "running"):
+            work.add_job(connection, work.JobRow(state, "diagnosis", state, "r", "a", 0.1, None, "x", START, START))
+        work.add_report(connection, work.ReportRow("p", "a", "r", "missing_physics", REPORT, START))
+        event = {"data": {"vehicle": "a", "page": ""}}
+        row = outbox.DeliveryRow("d", "sprung.report.ready", "x", event, "dead", 1, START, "x", START, START)
+        outbox.add_delivery(connection, row)
+        for table in metadata.sorted_tables:
+            texts = [c for c in table.c if isinstance(c.type, String | Text) and not c.primary_key]
+            for column in texts:
+                if not column.foreign_keys and not column.name.endswith("_id") and column.name not in STATES:
+                    connection.execute(table.update().where(column.is_not(None)).values({column.name: column + evil}))
+    seen = 0
+    for path in ("/", "/pages/vehicles/a", "/pages/vehicles/a/standing", "/pages/alarms", "/pages/work"):
+        answer = client.get(path, headers={"accept": "text/html", "authorization": f"Bearer {token}"})
+        text = answer.text
+        assert answer.status_code == 200 and "<h1>Sign in" not in text
+        assert "<img" not in text.replace('<img src="data:', "") and "onerror=alert(1)>" not in text, path
+        seen += text.count("&lt;img src=x")
+    assert seen >= 5
