@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI
 
+from sprung.benchmarks.serve_beside import beside_an_own_model
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.system import System, load_system
 from sprung.service.app import create_app
@@ -33,10 +35,12 @@ from sprung.service.settings import Settings
 
 TARGET_MS = 15.0
 WARM_UP = 20
+BESIDE = 10  # vehicles with a window a second, beside one with a model of its own
 
 
 def run(requests: int = 300, *, clients: int = 32, seconds: float = 5.0) -> Iterator[dict[str, Any]]:
-    """Figures: latencies one request after the other, then throughput with several clients."""
+    """Figures: latencies one request after the other, throughput with several clients, latencies beside a vehicle with
+    a model of its own."""
     system = load_system()
     body = window_body(system)
     context = multiprocessing.get_context("spawn")
@@ -56,6 +60,8 @@ def run(requests: int = 300, *, clients: int = 32, seconds: float = 5.0) -> Iter
             times = np.array([(echo.ask(), identify.ask()) for _ in range(WARM_UP + requests)])[WARM_UP:] * 1e3
             yield from _latencies(times, len(body))
             yield from _throughput(ports[1], body, clients, seconds)
+            others = partial(_ask_together, ports[1], body, BESIDE, 2 * seconds, rate=float(BESIDE))
+            yield from beside_an_own_model(ports[1], body, lambda: others()[1])
         finally:
             for server in servers:
                 server.terminate()

@@ -8,7 +8,7 @@ import sqlite3
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,9 +55,10 @@ def watched(
     beside: what else uses the service meanwhile, told its port and the time (`time.monotonic`) at which to end.
     """
     parts = window_body(load_system()).split(b'"bench"')
-    sent, memory = LoadSent(), list[tuple[float, int]]()
+    sent, memory = LoadSent(), MemorySeen()
     with ServiceProcess(folder, system=MANCHESTER) as served:
         served.ready()
+        lasting = {served.process.pid, *children(served.process.pid)}
         begun = time.monotonic() + 1.0
         ends = begun + 60 * minutes
         shares = [range(n, vehicles, connections) for n in range(connections)]
@@ -68,7 +69,7 @@ def watched(
         for thread in threads:
             thread.start()
         while any(thread.is_alive() for thread in threads):
-            memory.append((time.monotonic() - begun, resident(served.process.pid)))
+            memory.look(time.monotonic() - begun, served.process.pid, lasting)
             time.sleep(1.0)
         served.kill()
     yield from figures(folder / "sprung.db", sent, memory, minutes, vehicles, warm_up)
@@ -112,10 +113,24 @@ def _post(connection: http.client.HTTPConnection, body: bytes) -> int:
         return 0
 
 
-def resident(pid: int) -> int:
-    """Bytes of a process and its children; what several share counts once."""
+@dataclass
+class MemorySeen:
+    """Bytes by second: of the service and the processes that it keeps, and of those that it started for a job."""
+
+    lasting: list[tuple[float, int]] = field(default_factory=list)
+    jobs: list[int] = field(default_factory=list)
+
+    def look(self, second: float, pid: int, lasting: Collection[int]) -> None:
+        """Once more; lasting: the service and what it had started before there was any job."""
+        now = {pid, *children(pid)}
+        self.lasting.append((second, resident(now & set(lasting))))
+        self.jobs.append(resident(now - set(lasting)))
+
+
+def resident(pids: Iterable[int]) -> int:
+    """Bytes of processes; what several share counts once."""
     total = 0
-    for one in (pid, *children(pid)):
+    for one in pids:
         try:
             lines = Path(f"/proc/{one}/smaps_rollup").read_text().splitlines()
         except OSError:
@@ -127,7 +142,7 @@ def resident(pid: int) -> int:
 def figures(
     store: Path,
     sent: LoadSent,
-    memory: list[tuple[float, int]],
+    memory: MemorySeen,
     minutes: float,
     vehicles: int,
     warm_up: float = WARM_UP,
@@ -151,9 +166,10 @@ def figures(
         "sent_a_second_late": sent.late,
         "target": f"< {TARGET_SECONDS:g}",
     }
-    warm = [size for second, size in memory if second > warm_up * 60 * minutes and size]
+    warm = [size for second, size in memory.lasting if second > warm_up * 60 * minutes and size]
     if len(warm) > 10:
         tenth = max(1, len(warm) // 10)
         first, last = np.median(warm[:tenth]), np.median(warm[-tenth:])
         growth = round(100 * (float(last / first) - 1), 2)
         yield {"figure": "growth of memory after warm-up", "value": growth, "unit": "%", "mb": round(float(last) / 1e6)}
+        yield {"figure": "most memory of processes of jobs", "value": round(max(memory.jobs) / 1e6), "unit": "MB"}

@@ -237,6 +237,10 @@ def failing() -> None:
     raise OSError("database is locked")
 
 
+def failing_otherwise() -> None:
+    raise KeyError("nothing")
+
+
 def test_a_receiver_that_never_answers_holds_others_up_once(
     tmp_path: Path, store: Store, receiver: str, received: Received, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -262,7 +266,7 @@ def test_what_cannot_be_sent_at_all_holds_up_nothing(
 ) -> None:
     """Whatever the reason: it counts as an attempt, and the thread goes on."""
     alarm(core, system)
-    monkeypatch.setattr("sprung.service.notify.senders.post", lambda *_: {}["nothing"])
+    monkeypatch.setattr("sprung.service.notify.senders.post", lambda *_: failing_otherwise())
     assert core.notices.deliver(now_ns()) == 0
     monkeypatch.undo()
     assert core.notices.deliver(now_ns() + 6 * NANOSECONDS) > 0
