@@ -8,6 +8,7 @@ available", SAE J1939-71) are missing samples.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ INVALID_CHOICE = re.compile(
     r"^(sna|na|n/a|nan|init)$|(?<!no )(?<!no_)(?<!no)(?<!de)(fault|error|fail)",
     re.IGNORECASE,
 )
+MOST_BYTES, FLOAT_BITS = 64, (16, 32, 64)  # of a frame of CAN FD; of a field in IEEE 754
 ALL_ONES_BITS = 8  # a narrower field of all ones is an ordinary value
 
 
@@ -299,7 +301,14 @@ def _named(table: dict[str, Any], name: str, complaint: str, what: str) -> Any:
 
 
 def _signal_plan(index: int, signal: Signal, signals: dict[str, Signal], message: Message) -> SignalPlan:
-    conversion = signal.conversion
+    conversion, bits = signal.conversion, _bits(signal)
+    try:
+        scale, offset = float(conversion.scale), float(conversion.offset)
+    except OverflowError:  # integers without end
+        scale = offset = math.inf
+    if not (math.isfinite(scale) and math.isfinite(offset)) or scale == 0:
+        what = f"a scale of {scale:g} and an offset of {offset:g} make no values"
+        raise UnreadableRecording(f"signal {signal.name} of the CAN database: {what}")
     full = (1 << signal.length) - 1
     ranged = (signal.minimum, signal.maximum) != (None, None) and signal.minimum != signal.maximum
     invalid = {int(raw) & full for raw, text in _choices(signal) if INVALID_CHOICE.search(text)}
@@ -309,10 +318,10 @@ def _signal_plan(index: int, signal: Signal, signals: dict[str, Signal], message
     minimum, maximum = _binding_limits(signal) if ranged else (None, None)
     return SignalPlan(
         channel=index,
-        bits=_bits(signal),
+        bits=bits,
         kind="float" if conversion.is_float else "int" if signal.is_signed else "uint",
-        scale=float(conversion.scale),
-        offset=float(conversion.offset),
+        scale=scale,
+        offset=offset,
         minimum=minimum,
         maximum=maximum,
         invalid_raw=tuple(sorted(invalid)),
@@ -342,12 +351,22 @@ def _choices(signal: Signal) -> Iterable[tuple[int, str]]:
 
 
 def _bits(signal: Signal) -> Bits:
-    return Bits(signal.start, signal.length, signal.byte_order == "big_endian")
+    """Errors: UnreadableRecording for bits that no frame has."""
+    bits = Bits(signal.start, signal.length, signal.byte_order == "big_endian")
+    lengths = FLOAT_BITS if signal.conversion.is_float else range(1, 65)
+    if signal.length not in lengths or signal.start < 0 or bits.end > MOST_BYTES:
+        what = f"{signal.length} bits from bit {signal.start} on"
+        raise UnreadableRecording(f"signal {signal.name} of the CAN database: {what}, which no frame holds so")
+    return bits
 
 
 def _conditions(signal: Signal, signals: dict[str, Signal]) -> Iterable[tuple[Bits, tuple[int, ...]]]:
     """The chain of multiplexer fields above a signal (extended multiplexing nests them)."""
+    passed: set[str] = set()
     while signal.multiplexer_ids and signal.multiplexer_signal:
+        if signal.name in passed:
+            raise UnreadableRecording(f"signal {signal.name} of the CAN database: is multiplexed by itself")
+        passed.add(signal.name)
         parent = signals[signal.multiplexer_signal]
         yield _bits(parent), tuple(signal.multiplexer_ids)
         signal = parent

@@ -229,3 +229,36 @@ def test_a_database_file_gives_the_same_as_its_objects(tmp_path: Path) -> None:
     frames = block([b"\xff\xfe\0\0\0\0\0\0"], 0x18FF1234 | EXTENDED)
     samples = CanDecoder(channels_of(message), path).decode(frames, account)
     assert samples.value.tolist() == [-2.0]
+
+
+LINE = ' SG_ Speed : 0|16@1+ (1,0) [0|65000] "" Vector__XXX'
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        (LINE.replace("0|16@", "0|65@"), "65 bits from bit 0 on"),
+        (LINE.replace("0|16@", "0|99999@"), "99999 bits from bit 0 on"),
+        (LINE.replace("0|16@", "999999999|8@"), "8 bits from bit 999999999 on"),
+        (LINE.replace("(1,0)", "(0,0)"), "a scale of 0"),
+        (LINE.replace("(1,0)", "(1e999,0)"), "a scale of inf"),
+        (LINE.replace("(1,0)", "(1,1e999)"), "an offset of inf"),
+        (LINE.replace("(1,0)", f"({'9' * 400},0)"), "a scale of inf"),
+    ],
+)
+def test_signals_that_no_frame_can_hold_are_refused_in_one_line(line: str, told: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.dbc"
+    path.write_text(f'VERSION ""\n\nBU_:\n\nBO_ 291 Train: 8 Vector__XXX\n{line}\n')
+    with pytest.raises(UnreadableRecording) as refused:
+        CanDecoder([Channel("speed", "m/s", 0.1, can="Train.Speed")], path)
+    assert told in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_multiplexers_in_a_circle_are_refused(tmp_path: Path) -> None:
+    first, second = (
+        Signal(name, 8 * place, 8, is_multiplexer=True, multiplexer_ids=[1], multiplexer_signal=other)
+        for place, (name, other) in enumerate((("A", "B"), ("B", "A")))
+    )
+    database = Database([Message(0x123, "Train", 8, [Signal("C", 16, 8), first, second], strict=False)], strict=False)
+    with pytest.raises(UnreadableRecording, match="is multiplexed by itself"):
+        CanDecoder([Channel("speed", "m/s", 0.1, can="Train.A")], database)
