@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import logging
 import threading
@@ -80,6 +81,8 @@ class Core:
     statistics: FleetStatistics
     upload_room: UploadRoom
     waits: WaitMetrics
+    # vehicles' models are tried one after the other: each takes seconds of the interpreter that answers requests
+    trying: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(1))
     archive: Archive | None = None
     oidc: Provider | None = None  # where people sign in beside their tokens
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses

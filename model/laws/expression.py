@@ -16,6 +16,7 @@ from __future__ import annotations
 import ast
 import math
 import operator
+import threading
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,6 +25,7 @@ import numpy as np
 
 _LONGEST = 1000  # characters of a formula
 _MOST_INTEGER = 2**53  # beyond it integers are no doubles; larger numbers are written as 1e20
+_parsing = threading.Lock()  # CPython 3.11 counts the depth of all threads' trees together (cpython#106905)
 MOTION = ("d", "v", "t", "z", "k", "c")  # variables of a formula beside the law's parameters
 
 
@@ -89,7 +91,8 @@ def parse(text: str, known: Collection[str]) -> Expression:
     if len(text) > _LONGEST:
         raise FormulaError(f"formula {text[:40]!r}...: longer than {_LONGEST} characters")
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
+        with _parsing:
+            tree = ast.parse(text.strip(), mode="eval").body
         names = frozenset(_names(tree, text))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
         if isinstance(problem, FormulaError):

@@ -61,17 +61,22 @@ async def use(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: ModelBo
 
     async def act() -> Response:
         try:
-            if body.version is not None:
-                await run_in_threadpool(core.operations.use_model, actor.name, id_, body.version)
-            else:
-                text = body.system if body.system is not None else await _of_report(core, actor, id_, body.report or "")
-                await run_in_threadpool(core.operations.give_model, actor.name, id_, text, body.report)
+            async with core.trying:
+                await _use(core, actor, id_, body)
         except UserError as error:
             raise ApiProblem(422, str(error), [{"field": "system", "detail": str(error)}]) from error
         return json_response(await read(core, lambda connection: models_answer(core, connection, id_)))
 
     answer: Response = await once.answer(act)
     return answer
+
+
+async def _use(core: Core, actor: Actor, vehicle: str, body: ModelBody) -> None:
+    if body.version is not None:
+        await run_in_threadpool(core.operations.use_model, actor.name, vehicle, body.version)
+        return
+    text = body.system if body.system is not None else await _of_report(core, actor, vehicle, body.report or "")
+    await run_in_threadpool(core.operations.give_model, actor.name, vehicle, text, body.report)
 
 
 @router.get("/vehicles/{id}/models", summary="A vehicle's models", response_model=models.VehicleModels)

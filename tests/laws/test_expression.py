@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -82,3 +85,24 @@ def test_a_formula_says_the_same_in_c(tmp_path: Path) -> None:
     subprocess.run(["cc", "-o", str(tmp_path / "f"), str(source), "-lm"], check=True)
     shown = subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout
     assert float(shown) == pytest.approx(float(formula(**values)), rel=1e-14)
+
+
+def test_formulas_can_be_read_by_several_threads_at_once() -> None:
+    """As when several vehicles are given models: by itself CPython 3.11 raises SystemError where threads take turns
+    within a tree, as they do when objects are collected."""
+
+    def called(deep: int) -> str:  # at different depths, or nothing is noticed
+        return parse("+".join(["a*d*v*t"] * 30), {"a", "d", "v", "t"}).text if deep == 0 else called(deep - 1)
+
+    def yields(*_: object) -> None:
+        time.sleep(1e-4)
+
+    thresholds = gc.get_threshold()
+    gc.callbacks.append(yields)
+    gc.set_threshold(50)
+    try:
+        with ThreadPoolExecutor(8) as threads:
+            assert len(set(threads.map(called, (i % 40 for i in range(60))))) == 1
+    finally:
+        gc.callbacks.remove(yields)
+        gc.set_threshold(*thresholds)

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import http.client
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +23,12 @@ from sprung.service.api.vehicle_model import MOST_CHARACTERS
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Stage
+from sprung.service.errors import UserError
 from sprung.service.monitoring.engine import load_engine
 from sprung.service.processes.worker import Emit
 from sprung.service.settings import Settings
 from sprung.service.store.schema import audit
+from tests.served import served
 from tests.service_fakes import REPORT, eventually
 
 RATE = 200.0
@@ -219,6 +225,32 @@ def test_a_system_file_may_be_as_long_as_described(client: TestClient, core: Cor
     assert client.post("/vehicles/a/model", json={"system": text}).status_code == 200
     answer = client.post("/vehicles/a/model", json={"system": "a" * (MOST_CHARACTERS + 1)})
     assert answer.status_code == 422 and answer.json()["errors"][0]["field"] == "system"
+
+
+def test_models_are_tried_one_after_the_other(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many are sent at once: others keep the threads, and the interpreter's time."""
+    core.pipeline.process("a", [])
+    at_once = [0, 0]  # now, at most
+
+    def slow(*_: object) -> int:
+        at_once[0] += 1
+        at_once[1] = max(at_once)
+        time.sleep(0.05)
+        at_once[0] -= 1
+        raise UserError("no")
+
+    monkeypatch.setattr(core.operations, "give_model", slow)
+    with served(core) as port:
+
+        def give(_: int) -> int:
+            with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=60)) as connection:
+                kind = {"content-type": "application/json"}
+                connection.request("POST", "/vehicles/a/model", b'{"system": "x"}', kind)
+                return connection.getresponse().status
+
+        with ThreadPoolExecutor(50) as people:
+            assert set(people.map(give, range(50))) == {422}
+    assert at_once == [0, 1]
 
 
 def test_a_model_whose_windows_take_too_long_is_refused(
