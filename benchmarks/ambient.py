@@ -53,7 +53,7 @@ def accuracy(rides: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]:
     system = load_system(BUNDLED / "accelerometers.yaml")
     vehicle = read_vehicle(SYSTEM)
     for name, rows in SENSORS.items():
-        error, std, least, spent, fits = [], [], [], [], []
+        error, std, least, spent, fits, squares = [], [], [], [], [], []
         for number in range(rides):
             rng = np.random.default_rng([seed, number])
             ride = draw_ride(rng)
@@ -66,6 +66,7 @@ def accuracy(rides: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]:
                 raise RuntimeError(f"ride {number} of seed {seed} determined nothing")
             error.append(fit.log_ratio - np.append(ride.log_ratio, ride.load))
             std.append(np.sqrt(np.diag(fit.covariance)))
+            squares.append(error[-1] @ np.linalg.solve(fit.covariance, error[-1]) / len(error[-1]))
             least.append(bound(vehicle, ride, rows, seconds))
             fits.append(fit.chi_square)
         yield from _figures(name, rides, seconds, np.array(error), np.array(std), np.array(least))
@@ -74,6 +75,9 @@ def accuracy(rides: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]:
             "sensing": name,
             "cpu_seconds": float(np.median(spent)),
             "chi_square": float(np.median(fits)),
+            # over the whole covariance: what the unknowns of a ride have in common counts once; 1 if all is as stated
+            "error_squares": float(np.mean(squares)),
+            "error_squares_std": float(np.sqrt(2 / (len(error[0]) * rides))),
             "speed": "unknown",
         }
 

@@ -78,7 +78,7 @@ class Contradictions:
     """Of the channels of one system, in windows of one length."""
 
     def __init__(self, calibration: DeviationSensitivity, alike: IntArray) -> None:
-        """alike: number (C,) of the channels' clock and unit; only channels of one number may be exchanged."""
+        """alike: number (C,) of the channels' unit; only channels of one number, or of one support, may be exchanged."""
         self.calibration = calibration
         self.inputs = calibration.inputs
         self.candidates = rearrangements(alike)
@@ -103,13 +103,24 @@ class Contradictions:
         enough = noise + ENDED * (float(relations.violation(relations.rows).sum()) - noise)
         concerned = np.flatnonzero((relations.rows[violated] != 0).any(axis=0))
         absent = self.inputs + np.flatnonzero(~present)
-        return tuple(
+        ends = tuple(
             c
             for c in self.candidates
             if np.isin(c.columns, concerned).any()
             and not np.isin(c.columns, absent).any()
             and relations.violation(c.undone(relations.rows)).sum() < enough
         )
+        return ends + tuple(c for c in self._crossed(relations, violated) if self._left(c.undone(window)) < enough)
+
+    def _crossed(self, relations: _Relations, violated: BoolArray) -> list[Rearrangement]:
+        """Exchanges of two quantities of one support whose relation is violated: they are of different units."""
+        inputs = [np.flatnonzero(row[: self.inputs]).tolist() for row in relations.rows[violated]]
+        return [Rearrangement(pair) for columns in inputs for pair in combinations(columns, 2)]
+
+    def _left(self, window: FloatArray) -> float:
+        """What channels of a window (T, C) contradict each other by, in units of noise."""
+        relations = self._relations(window[None], self._present(window[None])[0])
+        return float(relations.violation(relations.rows).sum())
 
     def _present(self, windows: FloatArray) -> BoolArray:
         return np.asarray(~np.isnan(windows[:, :, self.inputs :]).any(axis=1))

@@ -20,7 +20,7 @@ import torch
 from scipy.interpolate import make_interp_spline
 
 from sprung.model.identification.any_inputs import RefinerOfAnyInputs
-from sprung.model.identification.contradictions import Contradictions, Rearrangement
+from sprung.model.identification.contradictions import Contradictions, Rearrangement, rearrangements
 from sprung.model.identification.deviations import clock_groups, named
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.linearise import as_rows
@@ -64,6 +64,11 @@ def fits(refined: Refined) -> BoolArray:
     return np.asarray((refined.chi_square < fit_limit(refined.freedom)) & refined.converged)
 
 
+def _numbers(things: Sequence[object]) -> IntArray:
+    """A number for each that only equal ones share."""
+    return np.array([things.index(thing) for thing in things], dtype=np.int64)
+
+
 class Explainer:
     """Searches for what is wrong with the measurements of windows of one system."""
 
@@ -81,9 +86,10 @@ class Explainer:
         self.channels = len(system.channels)
         self.names = [channel.name for channel in system.channels]
         self.groups = clock_groups(system)
-        alike = [(int(group), c.unit) for group, c in zip(self.groups, system.channels, strict=True)]
-        numbers = np.array([alike.index(one) for one in alike], dtype=np.int64)
-        self.contradictions = Contradictions(refiner(samples).calibration, numbers)
+        units = [channel.unit for channel in system.channels]
+        alike = [(int(group), unit) for group, unit in zip(self.groups, units, strict=True)]
+        self.contradictions = Contradictions(refiner(samples).calibration, _numbers(units))
+        self._rearrangements = rearrangements(_numbers(alike))  # tried where nothing contradicts: of one clock only
         self.stuck = StuckChannels(system)
         self._along = bool(system.loads or system.built)  # whether these are refined with the parameters
         self.directions = self._directions()
@@ -477,7 +483,7 @@ class Explainer:
 
     def _reversed(self, window: FloatArray) -> list[tuple[FloatArray, MeasurementFault]]:
         """Windows with one sign turned or two channels exchanged that fit better at nominal values, the best first."""
-        tries = [(one.undone(window), one.fault(self.names)) for one in self.contradictions.candidates]
+        tries = [(one.undone(window), one.fault(self.names)) for one in self._rearrangements]
         costs = self._nominal_cost(np.array([window, *(restored for restored, _ in tries)]))
         order = np.argsort(costs[1:])
         return [tries[i] for i in order[:_TRIALS] if costs[1 + i] < _BETTER * costs[0]]

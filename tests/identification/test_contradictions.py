@@ -39,14 +39,13 @@ def loaded() -> tuple[FloatArray, FloatArray]:
     return record(8, 11, 0.2, truth), truth
 
 
-@pytest.mark.parametrize("pair", [(16, 17), (18, 19), (20, 22), (0, 2)])
+@pytest.mark.parametrize("pair", [(16, 17), (18, 19), (20, 22), (0, 2), (20, 24), (16, 20), (1, 11), (4, 5)], ids=str)
 def test_exchanged_ends_of_a_loaded_vehicle_are_named_and_no_spring_is_wrong(
     system: System, loaded: tuple[FloatArray, FloatArray], pair: tuple[int, int]
 ) -> None:
     samples, truth = loaded
-    exchanged = samples.copy()
-    exchanged[:, pair] = samples[:, pair[::-1]]
-    values = windows(system, exchanged, hop=100)[1:7]
+    values = windows(system, samples, hop=100)[1:7]
+    values[:, :, pair] = values[:, :, pair[::-1]]  # with its noise
     names = "|".join(system.channels[c].name for c in pair)
     for estimate in Identifier(system).examine(values, np.zeros(6, dtype=bool)):
         assert [(f.channel, f.kind) for f in estimate.faults] == [(names, "swapped")]
