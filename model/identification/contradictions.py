@@ -78,7 +78,7 @@ class Contradictions:
     """Of the channels of one system, in windows of one length."""
 
     def __init__(self, calibration: DeviationSensitivity, alike: IntArray) -> None:
-        """alike: number (C,) of the channels' unit; only channels of one number, or of one support, may be exchanged."""
+        """alike: number (C,) of the channels' unit; channels of one number, or of one support, may be exchanged."""
         self.calibration = calibration
         self.inputs = calibration.inputs
         self.candidates = rearrangements(alike)

@@ -33,6 +33,7 @@ class Deviation:
     std: float  # what the data sheet leaves open: relative, or s; of loads see `model.simulate.loading`
     group: int  # channels that share a clock have the same number; -1 for a load
     node: int = -1  # clocks of one node have the same number; -1: not known
+    support: int = -1  # channels that measure the motion of one support have the same number; -1: of none
 
 
 def deviations(system: System) -> tuple[Deviation, ...]:
@@ -42,10 +43,11 @@ def deviations(system: System) -> tuple[Deviation, ...]:
     if tracks or not system.bodies:
         return ()  # unmeasured tracks and component tests have identifiers of their own
     channels = system.channels
-    clocks = list(zip(channels, system.tolerances, clock_groups(system), nodes(system), strict=True))
+    shared = (clock_groups(system), nodes(system), supports(system))
+    clocks = list(zip(channels, system.tolerances, *shared, strict=True))
     return (
-        *(Deviation(c.name, "gain", t.gain, g, n) for c, t, g, n in clocks),
-        *(Deviation(c.name, "delay", t.delay, g, n) for c, t, g, n in clocks),
+        *(Deviation(c.name, "gain", t.gain, g, n, s) for c, t, g, n, s in clocks),
+        *(Deviation(c.name, "delay", t.delay, g, n, s) for c, t, g, n, s in clocks),
         *(Deviation(term.body, term.kind, term.std, -1) for term in load_terms(system)),
     )
 
@@ -76,6 +78,36 @@ def nodes(system: System) -> IntArray:
         node, _, rest = (channel.mcap or "").strip("/").partition("/")
         numbers.append(found.setdefault(node if rest else f"\0{body}", len(found)))
     return np.array(numbers, dtype=np.int64)
+
+
+def supports(system: System) -> IntArray:
+    """The support that each channel measures the motion of, -1 where it is of none; shape (C,)."""
+    measured = [name for name, source in system.file.inputs.items() if not isinstance(source, ForceInput)]
+    names = [channel.name.partition(".")[0] for channel in system.inputs]
+    of_inputs = [measured.index(name) if name in measured else -1 for name in names]
+    return np.array([*of_inputs, *(-1 for _ in system.sensors)], dtype=np.int64)
+
+
+def shared_directions(deviations: Sequence[Deviation]) -> FloatArray:
+    """What several channels may have in common, as rows over the deviations (V, H), each once.
+
+    The delay of a clock, of all clocks of a node, of all supports measured by one node; gain and delay of a support,
+    whose quantities come from one instrument.
+    """
+    kind = np.array([d.kind for d in deviations])
+    group, node, support = (np.array([getattr(d, of) for d in deviations]) for of in ("group", "node", "support"))
+    late, gain = kind == "delay", kind == "gain"
+    below = late & (support >= 0)
+    parts = [
+        (late, group),
+        (late & (node >= 0), node),
+        (below, node),
+        (below, support),
+        (gain & (support >= 0), support),
+    ]
+    rows = [among & (number == one) for among, number in parts for one in np.unique(number[among])]
+    found = list(dict.fromkeys(tuple(row.tolist()) for row in rows if row.sum() > 1))
+    return np.array(found, dtype=np.float64).reshape(len(found), len(deviations))
 
 
 def _bodies(system: System) -> list[str]:

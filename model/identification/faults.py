@@ -21,7 +21,7 @@ from scipy.interpolate import make_interp_spline
 
 from sprung.model.identification.any_inputs import RefinerOfAnyInputs
 from sprung.model.identification.contradictions import Contradictions, Rearrangement, rearrangements
-from sprung.model.identification.deviations import clock_groups, named
+from sprung.model.identification.deviations import clock_groups, named, shared_directions
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.linearise import as_rows
 from sprung.model.identification.refine import Refined
@@ -101,15 +101,8 @@ class Explainer:
         self._clocks = self.directions[(np.array(whole) & alone).any(axis=0)]  # one delay for each clock
 
     def _directions(self) -> FloatArray:
-        """Simple explanations as rows over the deviations: each alone, and one delay for all that share a clock."""
-        H, C = len(self.deviations), self.channels
-        rows = list(np.eye(H))
-        for group in np.unique(self.groups):
-            together = np.zeros(H)
-            together[C : 2 * C] = self.groups == group
-            if together.sum() > 1:
-                rows.append(together)
-        return np.array(rows)
+        """Simple explanations as rows over the deviations: each alone, and what several channels have in common."""
+        return np.concatenate([np.eye(len(self.deviations)), shared_directions(self.deviations)])
 
     def again(
         self, windows: FloatArray, known: Mapping[int, tuple[MeasurementFault, ...]]

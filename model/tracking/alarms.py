@@ -86,6 +86,7 @@ class Attribution:
         alarms = [self._present(alarm, state, drift, now) for alarm in state.alarms]
         if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= self.model.jump_limit(jump.kind):
             alarms = self._with_sensor(alarms, jump, now)
+        alarms = self._narrowed(alarms, state, now)
         alarms = self._with_drifted(alarms, drifted, state, now)
         alarms = self._with_stuck(alarms, state, now)
         alarms = self._with_common(alarms, common, drift, now)
@@ -365,6 +366,26 @@ class Attribution:
             return _closed(replace(alarm, change=off, std=std), now)
         peak = off if abs(off) > abs(alarm.peak or 0.0) else alarm.peak
         return replace(alarm, change=off, std=std, peak=peak)
+
+    def _narrowed(self, alarms: list[Alarm], state: TrackerState, now: int) -> list[Alarm]:
+        """Alarms of several channels that share a gain or a delay without those that turn out not to have it: each
+        leaves an alarm when that would close if it were its own."""
+        out = list(alarms)
+        for i, alarm in enumerate(alarms):
+            channels, _, kind = (alarm.parameter or "").rpartition(".")
+            several = channels.split("|")
+            if alarm.kind != "sensor" or alarm.closed is not None or kind in HARD_FAULTS or len(several) < 2:
+                continue
+            own = [self._sensor_updated(replace(alarm, parameter=f"{name}.{kind}"), state, now) for name in several]
+            left = [name for name, one in zip(several, own, strict=True) if one.closed is None]
+            if not 0 < len(left) < len(several):
+                continue
+            out[i] = _closed(alarm, now)
+            name = f"{'|'.join(left)}.{kind}"
+            if not any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):
+                fresh = Alarm("sensor", name, alarm.onset, now, "warning", peak=alarm.peak)
+                out.append(self._sensor_updated(fresh, state, now))
+        return out
 
     def _with_stuck(self, alarms: list[Alarm], state: TrackerState, now: int) -> list[Alarm]:
         opened = {a.parameter for a in alarms if a.closed is None and a.kind == "sensor"}

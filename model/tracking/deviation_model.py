@@ -1,7 +1,7 @@
 """Constants of the deviations of one vehicle: prior, random walk, directions of jumps, thresholds.
 
 H deviations (gains, delays, loads, body constants; `model.identification.deviations`), V directions in which a jump is
-tested: each deviation alone, the delays of one clock, and those of all clocks of a node.
+tested: each deviation alone, and what several channels may have in common.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sprung.model.identification.deviations import CARGO, OWN, Deviation
+from sprung.model.identification.deviations import CARGO, OWN, Deviation, shared_directions
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.tracking.middle import median
 from sprung.model.tracking.rules import TRACKING_RULES, JumpRules
@@ -154,7 +154,7 @@ class DeviationModel:
 def model_of(deviations: Sequence[Deviation], rules: JumpRules = TRACKING_RULES.jumps) -> DeviationModel:
     """Delays of one clock share most of their variance; everything else is independent.
 
-    Jumps are tested along each deviation, along the delays of a clock, and along those of all clocks of a node.
+    Jumps are tested along each deviation, and along what several channels may have in common.
     """
     H = len(deviations)
     kinds = tuple(d.kind for d in deviations)
@@ -167,17 +167,7 @@ def model_of(deviations: Sequence[Deviation], rules: JumpRules = TRACKING_RULES.
     shared = np.where(together, GROUP_SHARE, 0.0) + own * np.where(late, 1 - GROUP_SHARE, 1.0)
     own_walk = {"gain": GAIN_WALK, "delay": OWN_WALK, **CARGO_WALK}
     walk = np.diag([own_walk.get(kind, 0.0) ** 2 for kind in kinds]).reshape(H, H) + together * CLOCK_WALK**2
-    rows = [*own[~constant]]
-    for number in np.unique(group[late]):
-        members = (late & (group == number)).astype(float)
-        if members.sum() > 1:
-            rows.append(members)
-    node = np.array([d.node for d in deviations], dtype=np.int64)
-    for number in np.unique(node[late & (node >= 0)]):
-        members = late & (node == number)
-        if len(np.unique(group[members])) > 1:  # the direction of a single clock is there already
-            rows.append(members.astype(float))
     loads = np.array([kind == "load" for kind in kinds], dtype=bool)
     cargo = np.array([kind in CARGO for kind in kinds], dtype=bool)
-    directions = np.array(rows).reshape(len(rows), H)
+    directions = np.concatenate([own[~constant], shared_directions(deviations)])
     return DeviationModel(kinds, shared * np.outer(std, std), walk, directions, loads, cargo, constant, rules)

@@ -178,6 +178,47 @@ def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(
     assert np.abs(mean / std).max() < 3.5
 
 
+def test_an_instrument_that_is_late_or_off_below_is_named_with_both_its_quantities_and_no_spring(
+    system: System, identifier: Identifier
+) -> None:
+    """Displacement and velocity of one wheel, later by 1 ms; too large by 3 %."""
+    healthy, wheel = record(75, 9), [8, 9]
+    gained = healthy.copy()
+    gained[:, wheel] *= 1.03
+    for wrong, kind in ((late(healthy, wheel, 0.001), "delay"), (gained, "gain")):
+        tracker, state = tracked(system, identifier, after(healthy, wrong, 35))
+        assert [(a.kind, a.parameter) for a in state.alarms] == [
+            ("sensor", f"wheel_21l.displacement|wheel_21l.velocity.{kind}")
+        ]
+        assert {(f.channel, f.kind) for f in tracker.sensors(state)} == {
+            ("wheel_21l.displacement", kind),
+            ("wheel_21l.velocity", kind),
+        }
+        mean, std = tracker.posterior(state)
+        assert np.abs(mean / std).max() < 3.5
+
+
+def test_all_wheels_of_a_bogie_that_are_late_are_named_and_not_its_sensors(
+    system: System, identifier: Identifier
+) -> None:
+    healthy = record(75, 10)
+    tracker, state = tracked(system, identifier, after(healthy, late(healthy, range(8), 0.002), 35))
+    assert {a.parameter for a in state.active} == {"|".join(c.name for c in system.channels[:8]) + ".delay"}
+    assert state.active[0].change == pytest.approx(0.002, abs=5e-4)
+    mean, std = tracker.posterior(state)
+    assert np.abs(mean / std).max() < 3.5
+
+
+def test_of_two_quantities_that_an_alarm_names_the_one_that_is_right_leaves_it(
+    system: System, identifier: Identifier
+) -> None:
+    """A large gain of a displacement alone begins within a window, which tells that of both and of one alike."""
+    healthy = record(70, 12)
+    wrong = healthy * np.where(np.arange(28) == 4, 1.1, 1)
+    _, state = tracked(system, identifier, after(healthy, wrong, 35.25))
+    assert [(a.kind, a.parameter) for a in state.active] == [("sensor", "wheel_12l.displacement.gain")]
+
+
 def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system: System, identifier: Identifier) -> None:
     healthy = record(75, 7)
     tracker, state = tracked(system, identifier, after(healthy, late(healthy, [20], -0.003), 35))
