@@ -68,11 +68,17 @@ class RetentionClock:
             mark = self._after_a_pause(wall)
         self._last = (monotonic, mark)
         if keep:
-            part = self._path.with_suffix(".part")
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_text(json.dumps(asdict(mark)))
-            part.replace(self._path)
+            try:
+                self._keep(mark)
+            except OSError as error:  # a full disk is no reason not to delete what is old
+                log.error("the clock of retention cannot be written down: %s", error)
         return mark.time_ns
+
+    def _keep(self, mark: _Mark) -> None:
+        part = self._path.with_suffix(".part")
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(json.dumps(asdict(mark)))
+        part.replace(self._path)
 
     def _after_a_pause(self, wall: int) -> _Mark:
         kept = self._kept()

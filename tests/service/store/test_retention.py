@@ -46,6 +46,16 @@ class Clocks:
         return RetentionClock(path, lambda: newest, lambda: self.wall, lambda: self.monotonic)
 
 
+def test_a_clock_that_cannot_be_written_down_goes_on_all_the_same(tmp_path: Path) -> None:
+    """On a full disk, what is old must be deleted more than ever."""
+    (tmp_path / "full").write_text("no folder")
+    clocks = Clocks(START)
+    clock = clocks.retention(tmp_path / "full" / "retention.json")
+    assert clock.now() == START
+    clocks.passed(3600)
+    assert clock.now() == START + HOUR
+
+
 def test_the_clock_goes_on_with_time_but_takes_no_leap(tmp_path: Path) -> None:
     path, clocks = tmp_path / "retention.json", Clocks(START)
     clock = clocks.retention(path)
