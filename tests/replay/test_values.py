@@ -2,6 +2,7 @@
 
 import json
 import struct
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -32,8 +33,8 @@ def dbc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def write_mcap(path: Path, bad: bytes, publish: int | None = None) -> None:
-    """The usual recording with one message of its own in row BAD_ROW."""
+def write_mcap(path: Path, bad: bytes | Sequence[bytes], publish: int | None = None) -> None:
+    """The usual recording with one message of its own in row BAD_ROW, or several from there on."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=4096)
         writer.start()
@@ -41,7 +42,9 @@ def write_mcap(path: Path, bad: bytes, publish: int | None = None) -> None:
         body = writer.register_channel("/body/acceleration", "json", schema)
         for row in range(ROWS):
             data = json.dumps({"left": LEFT[row], "axes": [{}, {"right": RIGHT[row]}]}).encode()
-            data, time = (bad, publish or int(TIMES[row])) if row == BAD_ROW else (data, int(TIMES[row]))
+            damaged = (bad,) if isinstance(bad, bytes) else bad
+            here = BAD_ROW <= row < BAD_ROW + len(damaged)
+            data, time = (damaged[row - BAD_ROW], publish or int(TIMES[row])) if here else (data, int(TIMES[row]))
             writer.add_message(body, int(TIMES[row]), data, time, row)
         writer.finish()
 
@@ -96,6 +99,40 @@ def test_a_message_that_is_none_costs_itself(message: bytes, tmp_path: Path) -> 
     assert recording.tally.used == ROWS - 1
     assert recording.tally.corrupt + recording.tally.dropped == 1
     assert not any("Error" in line for line in recording.problems)
+
+
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        (b'{"left": 1', b'"axes": []}', b'{"left": 5}, {"left": 6}'),
+        (b'{"left": 5}, {"left": 6}', b'{"left": 1', b'"axes": []}'),
+        (b'{"left": 1, "axes": [{}', b'{"right": 7}]}', b'{"left": 5}, {"left": 6}'),
+    ],
+)
+def test_parts_of_damaged_messages_never_make_up_one(damaged: tuple[bytes, ...], tmp_path: Path) -> None:
+    """As many as there are messages, and in the place of others."""
+    write_mcap(tmp_path / "a.mcap", damaged)
+    recording, samples = read(tmp_path / "a.mcap")
+    whole = (np.arange(ROWS) < BAD_ROW) | (np.arange(ROWS) >= BAD_ROW + 3)
+    assert np.array_equal(samples[0][0], TIMES[whole]) and np.array_equal(samples[0][1], VALUES[whole, 0])
+    assert recording.tally.corrupt == 3
+
+
+def test_a_definition_without_end_is_refused_before_it_is_parsed(tmp_path: Path) -> None:
+    """It took the square of its fields: two minutes for a file of 100 kB."""
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        text = "\n".join(f"float64 f{i}" for i in range(100_000))
+        schema = writer.register_schema("pkg/msg/Body", "ros2msg", text.encode())
+        body = writer.register_channel("/body/acceleration", "cdr", schema)
+        for row in range(20):
+            writer.add_message(body, int(TIMES[row]), bytes(64), int(TIMES[row]), row)
+        writer.finish()
+    begun = time.process_time()
+    with pytest.raises(UnreadableRecording, match="has more than 10000 lines"):
+        read(tmp_path / "a.mcap")
+    assert time.process_time() - begun < 5.0
 
 
 def test_a_message_of_another_era_is_left_out_and_reported(tmp_path: Path) -> None:
