@@ -23,8 +23,11 @@ from sprung.model.system import System
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any informative window
 _RIDGE = 1e-11  # relative, on the normalised free responses
-_SETTLING = 4  # times; each leaves a quarter of what initial states and lost inputs contradict each other by
-_UNSEEN = 1e-13  # of the largest free response: below is rounding; those that are seen differ by 1e-4, units included
+_TOLD = 0.01  # of the motion that a lost input may have at most: what it is believed to move by, where it is told
+_SHOWN = 1e-6  # relative ridge on free responses that hardly show where drives are lost
+_APART = 1e-6  # of the largest, below which what a lost input brings to the signals is no direction of its own
+_SETTLING = 2  # times that initial states and the motion of lost inputs are made to fit each other
+_UNSEEN = 1e-10  # of the largest free response: below is rounding; those that are seen differ by 1e-4, units included
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,7 @@ class _Residual:
     x0: Tensor  # best initial state, (B, N)
     cost: Tensor  # weighted squares with it, (B,)
     left: Tensor  # residual with it, (B, F, R, 1)
+    unweighed: Tensor | None  # the same before whitening; None: no drive is lost
 
 
 class WindowModel:
@@ -63,8 +67,10 @@ class WindowModel:
         self.compression = Compression(system, samples)
         lost = np.array([drive.lost for drive in drives_of(system)], dtype=bool)
         self.lost = int(lost.sum())  # drives that are not measured at all
+        self.lost_at = torch.as_tensor(np.flatnonzero(lost))
         self.instrument_noise = self.drive_noise * torch.as_tensor(~lost)  # without what is not measured at all
         self.blind = self._blind(lost)
+        self._taken: dict[bytes, int] = {}
         self.precision = torch.as_tensor(prior_std(system) ** -2)
 
     def _blind(self, lost: BoolArray) -> Tensor:
@@ -95,7 +101,19 @@ class WindowModel:
     def unknowns(self, present: BoolArray) -> int:
         """Numbers of a window that are eliminated: its first state, trends, and the spectra of lost inputs."""
         trends = self.compression.trends(present).shape[2] if self.compression.integrated else 0
-        return self.states_count + trends + 2 * self.bins * self.lost
+        return self.states_count + trends + 2 * self._directions_lost(present)
+
+    def _directions_lost(self, present: BoolArray) -> int:
+        """Complex numbers of a window's signals that the motion of lost inputs takes, at nominal values."""
+        if not self.lost:
+            return 0
+        key = present.tobytes()
+        if key not in self._taken:
+            nothing = torch.zeros(1, 0, present.sum(), dtype=torch.float64)
+            values = self.simulator.element_values(torch.zeros(1, len(self.system.parameters), dtype=torch.float64))
+            drive = self.transfer(values, WindowBatch(nothing, nothing, present, nothing)).drive
+            self._taken[key] = int(self._span(drive * self.drive_noise[:, None]).abs().square().sum().round())
+        return self._taken[key]
 
     def _open(self, free: Tensor, data: WindowBatch) -> Tensor:
         """Free responses (B, T, R, N) and what else is unknown of the window, (B, T, R, N')."""
@@ -107,14 +125,39 @@ class WindowModel:
     def with_lost(self, x: Tensor, data: WindowBatch) -> WindowBatch:
         """Windows whose lost inputs move as their sensors say at log-ratios x (B, P).
 
-        What they say is left out of the likelihood (`drive_noise`), but the motion of the vehicle, along which it is
-        linearised, is that with these inputs.
+        What they say is left out of the likelihood (`whitening`), but the motion of the vehicle, along which it is
+        linearised, is that with these inputs: the most likely one of a moderate size, since where sensors hardly show
+        it, noise would otherwise make it a wild one.
         """
         if not self.lost:
             return data
-        at = self._residual(x, data)
-        noise = self.noise_told(at.whiten, at.carried, at.left) * (self.drive_noise != self.instrument_noise)
-        return replace(data, w=self._with_noise(data.w, noise))
+        return replace(data, w=self._with_noise(data.w, self._of_lost(self._residual(x, data), data)))
+
+    def _of_lost(self, at: _Residual, data: WindowBatch) -> Tensor:
+        """What the spectra of lost drives are more, (B, F, W/2), than in the windows that left a residual."""
+        assert at.unweighed is not None
+        lost, told = self._told()
+        carried = at.carried * told[:, None]
+        whiten = self._by_noise(carried)
+        before = self.spectra(data.w[:, :, 0::2]) * lost
+        shown = at.unweighed + at.transfer.drive @ before.unsqueeze(3)
+        return self.noise_told(whiten, carried, whiten @ shown) * told * lost - before
+
+    def _told(self) -> tuple[Tensor, Tensor]:
+        """Which drives are lost, and how far what is told of them is believed, each (F, W/2)."""
+        lost = self.drive_noise != self.instrument_noise
+        return lost.to(self.frequency.jw.dtype), torch.where(lost, _TOLD, 1.0)
+
+    def _moving(self, carried: Tensor, residual: Tensor, free: Tensor) -> Tensor:
+        """First states (B, N') with which windows move while drives are lost: also those that only lost drives show.
+
+        residual (B, F, R, 1) and free responses (B, F, R, N'), as spectra of the signals.
+        """
+        whiten = self._by_noise(carried * self._told()[1][:, None])
+        r, (basis, scale) = as_rows(whiten @ residual), normalised(as_rows(whiten @ free))
+        products = basis @ basis.mT + _SHOWN * torch.eye(basis.shape[1], dtype=basis.dtype)
+        found: Tensor = torch.linalg.solve(products, basis @ r.mT).squeeze(2) / scale
+        return found
 
     def settled(self, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, WindowBatch]:
         """Initial states x0 (B, N) and windows whose lost inputs move as their sensors say, which fit each other.
@@ -144,8 +187,8 @@ class WindowModel:
         transfer = self.transfer(values, data)
         carried = transfer.drive * self.drive_noise[:, None]
         whiten = self.whitening(carried)
-        white_residual = whiten @ self.spectra(residual).unsqueeze(3)  # (B, F, R, 1)
-        white_free = whiten @ self.spectra(free)  # (B, F, R, N)
+        plain, plain_free = self.spectra(residual).unsqueeze(3), self.spectra(free)
+        white_residual, white_free = whiten @ plain, whiten @ plain_free  # (B, F, R, 1), (B, F, R, N)
         r, basis = as_rows(white_residual), as_rows(white_free)  # (B, 1, K), (B, N, K)
         basis, free_scale = normalised(basis)
         products = basis @ basis.mT
@@ -154,22 +197,48 @@ class WindowModel:
         x0_scaled = torch.cholesky_solve(along, factor).squeeze(2)
         x0 = x0_scaled / free_scale
         cost = r.square().sum(dim=(1, 2)) - (along.squeeze(2) * x0_scaled).sum(dim=1)
-        left = white_residual - white_free @ x0[:, None, :, None].to(white_free.dtype)
+        initial = x0[:, None, :, None].to(white_free.dtype)
+        left = white_residual - white_free @ initial
+        unweighed = None
+        if self.lost:
+            x0 = self._moving(carried, plain, plain_free)
+            unweighed = plain - plain_free @ x0[:, None, :, None].to(plain_free.dtype)
         x0 = x0[:, : discrete.Ad.shape[1]]
         return _Residual(
-            values, discrete, forced, transfer, carried, whiten, r, basis, free_scale, factor, along, x0, cost, left
+            values,
+            discrete,
+            forced,
+            transfer,
+            carried,
+            whiten,
+            r,
+            basis,
+            free_scale,
+            factor,
+            along,
+            x0,
+            cost,
+            left,
+            unweighed,
         )
 
     def linearise(self, x: Tensor, data: WindowBatch) -> Linearisation:
         """Everything at log-ratios x (B, P)."""
         s, at = self.simulator, self._residual(x, data)
-        moved = self.moved_by(at.values, at.transfer.compliance, self.noise_told(at.whiten, at.carried, at.left))
+        noise = self.noise_told(at.whiten, at.carried, at.left)
+        if self.lost:
+            noise = noise + self._of_lost(at, data)
+        moved = self.moved_by(at.values, at.transfer.compliance, noise)
         states = at.forced + s.free_states(at.discrete, at.x0, self.samples)
         J = as_rows(self._by_unknowns(x.shape[1], at.values, at.transfer, at.whiten, states, data, moved))
         across_products = at.basis @ J.mT
         across = torch.cholesky_solve(across_products, at.factor)
-        information = J @ J.mT - across_products.mT @ across
-        gradient = (J @ at.r.mT - across.mT @ at.along).squeeze(2)
+        if self.lost or not data.present.all():  # of free responses that hardly show, differences of products cancel
+            left = J - across.mT @ at.basis
+            information, gradient = left @ left.mT, (left @ at.r.mT).squeeze(2)
+        else:
+            information = J @ J.mT - across_products.mT @ across
+            gradient = (J @ at.r.mT - across.mT @ at.along).squeeze(2)
         precision = self.precision[: x.shape[1]]
         covariance = torch.linalg.inv(information + torch.diag(precision))
         step = (covariance @ (gradient - x * precision).unsqueeze(2)).squeeze(2)
@@ -361,7 +430,28 @@ class WindowModel:
         return Transfer(compliance, per_load, per_force, drive)
 
     def whitening(self, carried: Tensor) -> Tensor:
-        """Whitening matrices (B, F, R, R) where the drives' noise brings `carried` (B, F, R, W/2) to the signals."""
+        """Whitening matrices (B, F, R, R) where the drives' noise brings `carried` (B, F, R, W/2) to the signals.
+
+        What any motion of lost drives may bring to them is projected out.
+        """
+        if not self.lost:
+            return self._by_noise(carried)
+        measured = carried.clone()
+        measured[..., self.lost_at] = 0.0
+        whiten = self._by_noise(measured)
+        directions = self._span(whiten @ carried)
+        left: Tensor = whiten - directions @ (directions.mH @ whiten)
+        return left
+
+    def _span(self, carried: Tensor) -> Tensor:
+        """Orthonormal directions (B, F, R, X) that what lost drives bring to the signals spans; zero where fewer."""
+        u, size, _ = torch.linalg.svd(carried[..., self.lost_at], full_matrices=False)
+        seen = size > _APART * size.amax(dim=2, keepdim=True)
+        found: Tensor = u * seen.unsqueeze(2).to(u.dtype)
+        return found
+
+    def _by_noise(self, carried: Tensor) -> Tensor:
+        """Whitening matrices (B, F, R, R) for noise `carried` (B, F, R, W/2) beside that of the signals."""
         R = carried.shape[2]
         covariance = torch.eye(R, dtype=carried.dtype) + carried @ carried.mH
         factor = torch.linalg.cholesky(covariance)

@@ -221,7 +221,8 @@ class Refiner:
     def _weigh(
         self, which: Tensor, at: Linearisation, second: Chord, data: WindowBatch, progress: _Progress, rows: Tensor
     ) -> None:
-        """Evidence on deviations of the windows `which` of a chunk."""
+        """Evidence on deviations of the windows `which` of a chunk whose covariance rounding has left positive."""
+        which = which[torch.linalg.cholesky_ex(at.covariance[which])[1] == 0]
         if len(which):
             at, second, data = at.take(which), second.take(which), data.take(which)
             carried = at.transfer.drive * self.model.drive_noise[:, None]

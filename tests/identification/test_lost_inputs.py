@@ -222,3 +222,27 @@ def test_the_stated_misfit_of_a_window_without_an_input_is_that_of_what_the_sens
     for lossy, whole in zip(Identifier(system).identify(silent), Identifier(system).identify(values[:6]), strict=True):
         assert lossy.nrmse < 3 * whole.nrmse
         assert np.all(lossy.per_sensor < whole.per_sensor + 0.12)  # beyond the band nothing is told of a lost input
+
+
+@pytest.mark.parametrize(
+    ("silent", "known"),
+    [
+        (("wheel_1", "bogie1"), ("primary_2", "secondary_2")),  # everything that one node sends
+        (("wheel_1", "bogie1_1"), ("primary_2", "secondary")),
+        (("wheel_1",), ("primary_2", "secondary")),
+    ],
+)
+def test_what_a_dead_node_measured_is_unknown_and_all_else_as_certain_as_stated(
+    silent: tuple[str, ...], known: tuple[str, ...]
+) -> None:
+    system, values, truth = drawn("manchester.yaml")
+    some = values.copy()
+    some[:, :, [c.name.startswith(silent) for c in system.channels]] = np.nan
+    found = Identifier(system).examine(some, np.ones(len(some), dtype=bool))
+    seen = np.array([p.name.startswith(known) for p in system.parameters])
+    assert np.mean([e.adequate for e in found]) > 0.9
+    assert not any(e.identifiable[~seen].any() for e in found)
+    assert np.mean([e.identifiable[seen].mean() for e in found]) > 0.98
+    errors = np.array([(e.log_ratio - t) / np.sqrt(np.diag(e.covariance)) for e, t in zip(found, truth, strict=True)])
+    shown = np.array([e.identifiable for e in found])
+    assert 0.8 < np.sqrt(np.mean(errors[shown] ** 2)) < 1.2
