@@ -7,7 +7,9 @@ import hashlib
 import hmac
 import json
 import smtplib
+import socket
 import ssl
+import threading
 import time
 from collections.abc import Sequence
 from email.message import EmailMessage
@@ -19,6 +21,7 @@ from sprung.service.notify.events import sentence
 from sprung.service.settings import Settings
 
 SECONDS = 10.0
+MAIL_SECONDS = 60.0  # of all that a mail server says; some greet slowly on purpose
 SUCCESS = range(200, 300)
 ENCODED = "whsec_"  # begins a secret in base64
 
@@ -61,6 +64,23 @@ def signing_key(secret: str | None) -> bytes:
         ) from None
 
 
+class _BoundedSmtp(smtplib.SMTP):
+    """Hung up on when all of it takes long: the time-out of a socket restarts with every byte, and servers that slow
+    down strangers send them one by one."""
+
+    _ended: threading.Timer | None = None
+
+    def _get_socket(self, host: str, port: int, timeout: float) -> socket.socket:
+        line: socket.socket = super()._get_socket(host, port, timeout)  # type: ignore[misc]
+        self._ended = outside.hung_up_after(line, MAIL_SECONDS)
+        return line
+
+    def close(self) -> None:
+        if self._ended is not None:
+            self._ended.cancel()
+        super().close()
+
+
 def mail(settings: Settings, address: str, event: dict[str, Any]) -> None:
     """A plain mail with the sentence, what to do, and where to look."""
     message = EmailMessage()
@@ -70,7 +90,7 @@ def mail(settings: Settings, address: str, event: dict[str, Any]) -> None:
     lines = [sentence(event), event["data"].get("advisory") or "", *event["data"].get("findings", [])]
     lines += [event["data"]["page"], "", json.dumps(event, indent=1)]
     message.set_content("\n".join(line for line in lines if line is not None))
-    with smtplib.SMTP(settings.smtp_host, settings.smtp_port, timeout=SECONDS) as server:
+    with _BoundedSmtp(settings.smtp_host, settings.smtp_port, timeout=SECONDS) as server:
         if settings.smtp_starttls:
             server.starttls(context=ssl.create_default_context())
         if settings.smtp_user and settings.smtp_password:

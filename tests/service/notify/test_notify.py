@@ -11,6 +11,7 @@ import socketserver
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -188,6 +189,30 @@ def test_mail_goes_through_smtp(tmp_path: Path, store: Store) -> None:
         thread.join()
     assert "Subject: car-17: mismatch report: missing physics" in got[0]
     assert "dry friction at secondary_2r" in got[0] and "To: depot@example.org" in got[0]
+
+
+def test_a_mail_server_that_drips_is_hung_up_on(tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sprung.service.notify.senders.MAIL_SECONDS", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def drip() -> None:
+            line, _ = listening.accept()
+            with line, suppress(OSError):
+                for _ in range(100):
+                    line.sendall(b"220-wait\r\n")
+                    time.sleep(0.1)
+
+        dripping = threading.Thread(target=drip, daemon=True)
+        dripping.start()
+        port = listening.getsockname()[1]
+        settings = Settings(data_dir=tmp_path, mail_to=("a@example.org",), smtp_host="127.0.0.1", smtp_port=port)
+        notices = Notices(settings, store)
+        with store.write() as connection:
+            notices.report(connection, "car-17", "r1", {"verdict": "none"})
+        begun = time.monotonic()
+        assert notices.deliver(now_ns()) == 0
+        assert time.monotonic() - begun < 5.0
+        dripping.join()
 
 
 def test_a_lost_bus_is_reported_once_and_told_when_it_is_back(tmp_path: Path, store: Store) -> None:
