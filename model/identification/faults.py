@@ -89,7 +89,10 @@ class Explainer:
         units = [channel.unit for channel in system.channels]
         alike = [(int(group), unit) for group, unit in zip(self.groups, units, strict=True)]
         self.contradictions = Contradictions(refiner(samples).calibration, _numbers(units))
-        self._rearrangements = rearrangements(_numbers(alike))  # tried where nothing contradicts: of one clock only
+        # Tried where nothing contradicts: of one clock, and of inputs, whose supports may be measured but once
+        wide = rearrangements(_numbers(units))
+        near = set(rearrangements(_numbers(alike)))
+        self._rearrangements = [r for r in wide if r in near or max(r.columns) < len(system.inputs)]
         self.stuck = StuckChannels(system)
         self._along = bool(system.loads or system.built)  # whether these are refined with the parameters
         self.directions = self._directions()

@@ -241,6 +241,8 @@ class Attribution:
             others = self._masses_of(members.tolist(), whole)
         else:
             name, change, std = self.names[i], float(drift.change[i]), float(drift.std[i])
+            if abs(change) < self._rules.certain * std:  # by now a gain, a delay or a load explains what the test saw
+                return None
             others = (*deviations, *self._masses_of([i], whole))
         alarm = Alarm("change", name, since, now, "warning", 0.0, 0.0, 0.0, alternatives=others)
         return self._updated(alarm, change, std)

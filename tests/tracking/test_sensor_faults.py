@@ -77,9 +77,13 @@ def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor() -> 
     changed = replace(state.changes, active=np.array([1, 0, 0, 0, 0, 0], dtype=np.int8), up_since=since)
     recent = np.full(3, EPOCH + 37 * SECOND)
 
-    def opened(slope: FloatArray, at: int = now) -> list[str]:
+    away = state.belief.mean.copy()
+    away[0] += 0.1
+
+    def opened(slope: FloatArray, at: int = now, mean: FloatArray = away) -> list[str]:
         calibration = replace(state.calibration, slope=slope, curvature=np.ones_like(slope), recent=recent)
-        asked = replace(state, changes=changed, calibration=calibration)
+        belief = replace(state.belief, mean=mean)
+        asked = replace(state, changes=changed, calibration=calibration, belief=belief)
         drift = tracker._fusion.drift(asked)
         return [a.kind for a in tracker._attribution.updated(asked, drift, None, at)]
 
@@ -89,6 +93,7 @@ def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor() -> 
     assert opened(quiet) == ["change"]
     assert opened(rising) == []
     assert opened(rising, now + 30 * SECOND) == ["change"]  # not for ever
+    assert opened(rising, now + 30 * SECOND, state.belief.mean) == []  # but not if by now it is explained
 
 
 def test_a_state_that_did_not_know_how_loads_are_spread_goes_on() -> None:
