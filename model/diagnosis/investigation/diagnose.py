@@ -21,8 +21,9 @@ from sprung.model.diagnosis.investigation.named_laws import with_laws_together, 
 from sprung.model.diagnosis.investigation.next_finding import next_finding
 from sprung.model.diagnosis.investigation.redundant import without_redundant
 from sprung.model.diagnosis.investigation.restated import restated
-from sprung.model.diagnosis.investigation.setup import fitted_samples, without_setup_faults
+from sprung.model.diagnosis.investigation.setup import without_setup_faults
 from sprung.model.diagnosis.investigation.setup_effects import Hypothesis
+from sprung.model.diagnosis.investigation.setup_fitted import FittedSetup
 from sprung.model.diagnosis.investigation.significance import (
     shared_gain_covariance,
     without_insignificant,
@@ -141,11 +142,10 @@ def begun(
     progress(0.05, "nominal structure identified again; screening all laws at all places")
     start = nominal(system, signals, declared, split, options)
     progress(0.15, "set-up: signs, channels, nodes, scales, positions")
-    system, corrected, setup = without_setup_faults(
-        system, signals, declared, split, start.problem, start.fit, suspected
-    )
+    as_recorded = FittedSetup(system, signals, split, declared, start.problem, start.fit)
+    corrected, setup = without_setup_faults(as_recorded, suspected)
     if setup:
-        split, signals = fitted_samples(signals, corrected, split), corrected
+        system, signals, split = corrected.system, corrected.signals, corrected.split
         start = nominal(system, signals, declared, split, options)
     progress(0.2, "input channels")
     faults: tuple[InputFault, ...] = ()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.investigation.calibration import faulty, within_tolerance
-from sprung.model.diagnosis.investigation.setup import SetupFault
+from sprung.model.diagnosis.investigation.setup_fitted import SetupFault
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.report.report import Finding, LawParameter

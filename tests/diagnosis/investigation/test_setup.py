@@ -9,7 +9,8 @@ from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicl
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR
 from sprung.benchmarks.setups import KINDS, falsified, in_order
 from sprung.model.diagnosis.fit.baseline import baseline
-from sprung.model.diagnosis.investigation.setup import SetupFault, without_setup_faults
+from sprung.model.diagnosis.investigation.setup import without_setup_faults
+from sprung.model.diagnosis.investigation.setup_fitted import FittedSetup, SetupFault
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.record.split import cut
@@ -28,7 +29,7 @@ def found(system: System, values: np.ndarray) -> tuple[SetupFault, ...]:
     signals, split = cut(prepare(system, values, 100.0).signals)
     declared = declared_noise(system, signals)
     problem, fit = baseline(system, signals, declared, split)
-    return without_setup_faults(system, signals, declared, split, problem, fit)[2]
+    return without_setup_faults(FittedSetup(system, signals, split, declared, problem, fit))[1]
 
 
 def test_a_right_set_up_is_left_alone(vehicle: tuple[System, np.ndarray]) -> None:

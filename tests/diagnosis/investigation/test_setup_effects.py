@@ -9,7 +9,6 @@ import pytest
 
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR
 from sprung.model.diagnosis.fit.baseline import baseline
-from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.setup_changes import attached
 from sprung.model.diagnosis.investigation.setup_effects import (
     ELEMENT_POSITION,
@@ -22,6 +21,7 @@ from sprung.model.diagnosis.investigation.setup_effects import (
     Hypothesis,
     SetupPlace,
 )
+from sprung.model.diagnosis.investigation.setup_fitted import SetupFault
 from sprung.model.diagnosis.investigation.setup_response import Group
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
