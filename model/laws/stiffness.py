@@ -30,7 +30,8 @@ def _typical_cubic(seen: Observed) -> float:
 
 def _cubic(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (k3,) = p
-    found: FloatArray = k3 * motion.deflection**3
+    d = motion.deflection
+    found: FloatArray = k3 * d * d * d  # far faster than a power
     return found
 
 

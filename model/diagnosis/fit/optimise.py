@@ -34,6 +34,7 @@ from sprung.model.signals import FloatArray
 _DAMPING = (1e-6, 1e3)  # first and most, of the scaled normal equations
 _MUCH = 0.03  # of chi-square, that a step promises: if it fails, its initial state is estimated anew
 _STARTS, _LOWER = 5, 0.01  # of these, at most, while each lowers the objective by this share
+_HOPEFUL = 0.5  # of the fall that is needed, that it has to promise; where it succeeded, it promised 0.96 and more
 
 
 @dataclass(frozen=True)
@@ -220,16 +221,18 @@ def _state(problem: Problem, point: Point, working: Working) -> _State:
     return _State(replace(point, warm_start=warm_start_of(lin.forces)), working, lin, value)
 
 
-def _begun_anew(problem: Problem, state: _State) -> _State:
+def _begun_anew(problem: Problem, state: _State, below: float = np.inf) -> _State:
     """A free decay with the optimal initial state for its parameters (variable projection, Golub and Pereyra 1973).
 
     Joint steps converge slowly, since parameters act on the motion of the previous initial state; from rest, where
-    they have no effect, they would converge to the prior.
+    they have no effect, they would converge to the prior.  below: nothing is tried that promises far less.
     """
-    columns = state.lin.jacobian[:, -len(state.point.state) :]
-    if not (np.isfinite(columns).all() and np.isfinite(state.lin.residual).all()):
+    columns, residual = state.lin.jacobian[:, -len(state.point.state) :], state.lin.residual
+    if not (np.isfinite(columns).all() and np.isfinite(residual).all()):
         return state  # diverged: judged by its value
-    step = np.linalg.lstsq(columns, state.lin.residual, rcond=None)[0]
+    step = np.linalg.lstsq(columns, residual, rcond=None)[0]
+    if float(np.sum((columns @ step) ** 2)) < _HOPEFUL * (state.value - below):
+        return state
     other = _state(problem, replace(state.point, state=state.point.state + step), state.working)
     return other if other.value < state.value else state
 
@@ -244,7 +247,7 @@ def _lower_by_its_start(problem: Problem, proposed: _State, below: float) -> _St
         forces = proposed.lin.forces
         if proposed.value < below or forces is None or not forces.converged:
             break
-        other = _begun_anew(problem, proposed)
+        other = _begun_anew(problem, proposed, below)
         if other.value > proposed.value - _LOWER * abs(proposed.value):
             break
         proposed = other
