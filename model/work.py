@@ -43,6 +43,10 @@ class WorkBudget:
         """Budgets for `count` threads, each with all that is left: independent of the other threads' progress."""
         return [WorkBudget(self.most - self.done, self.until, self.clock) for _ in range(count)]
 
+    def portion(self, share: float) -> WorkBudget:
+        """A budget of a share of what is left, for a part of the search that others may not have to wait for."""
+        return WorkBudget(share * (self.most - self.done), self.until, self.clock)
+
     def gather(self, parts: Sequence[WorkBudget]) -> None:
         """Count the work of threads."""
         self.done += sum(part.done for part in parts)

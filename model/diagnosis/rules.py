@@ -278,6 +278,9 @@ class FormulaRules:
     rival: float = rule(10.0, "evidence behind, at which another formula is equivalent; chosen: odds of 150", 5.0, 20.0)
     agree: float = rule(0.1, "of its force, by which rivals differ; chosen: a false one is 0.15 off", 0.05, 0.15)
     explains: float = rule(0.97, "of the unnamed force's gain, that a formula must explain; chosen", 0.9, 0.995)
+    work: float = rule(
+        0.3, "of the work that is left, for the search of one; chosen: three more laws may be found after it", 0.2, 0.6
+    )
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sprung.model.diagnosis.investigation.formula import excess_chi_square, formula_of
@@ -22,14 +24,24 @@ def with_formula(state: Investigation, plain: list[Trial], trials: list[Trial]) 
     leader = _force_to_express(state, plain)
     if leader is None or state.problem.process_noise or not state.options.unnamed:
         return trials, ()
-    with np.errstate(all="ignore"):  # trial formulas overflow
-        formula, reason = formula_of(state.problem, state.fit, leader, state.held)
+    formula, reason = _formula(state, leader)
     if formula is not None and _replaces(state, trials[0], formula):
         return [formula, *(trial for trial in trials if trial is not leader or trial.named)], ()
     if formula is not None or trials[0].named:
         return trials, ()
     place = leader.term.location
     return trials, (f"{place}: surface only; {reason}",)
+
+
+def _formula(state: Investigation, leader: Trial) -> tuple[Trial | None, str]:
+    """The formula of an unnamed force, or None and the reason, with a share of the work that is left."""
+    work = state.problem.work
+    own = None if work is None else work.portion(state.options.rules.formula.work)
+    with np.errstate(all="ignore"):  # trial formulas overflow
+        found = formula_of(replace(state.problem, work=own), state.fit, leader, state.held)
+    if work is not None and own is not None:
+        work.gather([own])
+    return found
 
 
 def _replaces(state: Investigation, leader: Trial, formula: Trial) -> bool:

@@ -28,7 +28,7 @@ def with_named_laws(
     if unnamed.problem.process_noise or _needs_no_names(unnamed):
         return unnamed
     progress(share_done(len(before.found) + 0.5), "named laws in place of an unnamed force")
-    named = search(replace(before, options=replace(before.options, unnamed=False)))
+    named = search(replace(before, options=replace(before.options, unnamed=False), tried=unnamed.tried))
     if len(named.found) <= len(before.found) or not _explains_as_much(before, unnamed, named):
         return unnamed
     if _is_formula(last):

@@ -19,7 +19,14 @@ from sprung.model.diagnosis.investigation.calibration import (
 from sprung.model.diagnosis.investigation.formula_trial import with_formula
 from sprung.model.diagnosis.investigation.masses import imitates_errors
 from sprung.model.diagnosis.investigation.minor import is_minor, sought, untried
-from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress, WidenedFit, share_done
+from sprung.model.diagnosis.investigation.state import (
+    AcceptedFinding,
+    Investigation,
+    Progress,
+    TriedTrials,
+    WidenedFit,
+    share_done,
+)
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.investigation.widened import (
     adopt_wider,
@@ -47,6 +54,7 @@ class _Competition:
     findings: list[Trial]  # of these, the ones whose evidence makes them findings
     leading: list[Trial]  # the findings in order of preference
     implausible: list[tuple[Trial, str]]  # of more evidence than any finding, with the reason for doubt
+    tried: list[Trial]  # all of them, in the forms in which they were candidates
 
     def before(self, other: _Competition) -> _Competition:
         """This one, whose leading trial is the best of both if it has one, with the trials of another one behind it."""
@@ -56,6 +64,7 @@ class _Competition:
             [*self.findings, *other.findings],
             [*self.leading, *other.leading],
             [*self.implausible, *((trial, reason) for trial, reason in other.implausible if trial.evidence > best)],
+            [*self.tried, *other.tried],
         )
 
 
@@ -80,7 +89,9 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
         beside = _beside_narrow(state, wide, candidates, told)
         widened = is_better(state, wide, beside.leading)
         competition = beside.before(competition)
-    state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in competition.implausible)))
+    tried = TriedTrials(state.fit, tuple(competition.tried))
+    notes = (*state.notes, *(_implausible_note(*one) for one in competition.implausible))
+    state = replace(state, tried=tried, notes=notes)
     if wide is not None and widened:
         return next_finding(adopt_wider(state, wide), number, progress)
     if not competition.leading:
@@ -134,9 +145,11 @@ def _competition(
     instead: the wider form of a law that would be adopted without them; what explains more is no inaccuracy of it.
     """
     if not candidates:
-        return _Competition([], [], [], [])
+        return _Competition([], [], [], [], [])
     rules = state.options.rules
-    tried = with_wider_rivals(state, compete(state.problem, state.fit, candidates, progress))
+    known = state.tried.trials if state.tried is not None and state.tried.beside is state.fit else ()
+    fitted = compete(state.problem, state.fit, candidates, progress, known)
+    tried = with_wider_rivals(state, fitted)
     doubts = [(trial, doubt(trial.fit, trial.term, rules.plausible, before=state.fit)) for trial in tried]
     believed = [trial for trial, reason in doubts if reason is None]
     present = [trial for trial in tried if trial.finished and not hardly_there(trial.fit, rules.plausible)]
@@ -147,7 +160,7 @@ def _competition(
     leading.sort(key=lambda t: t.candidate.family.rank)  # faults of the inputs first, of forces as of motions
     best = max((trial.evidence for trial in leading), default=-np.inf)
     implausible = [(t, reason) for t, reason in doubts if reason and t.evidence > best and _contains(worthy, t)]
-    return _Competition(believed, findings, leading, implausible)
+    return _Competition(believed, findings, leading, implausible, fitted)
 
 
 def _beside_narrow(

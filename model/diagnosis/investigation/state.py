@@ -126,6 +126,14 @@ class TriedWider:
 
 
 @dataclass(frozen=True)
+class TriedTrials:
+    """All fitted candidates of a competition."""
+
+    beside: Fit
+    trials: tuple[Trial, ...]
+
+
+@dataclass(frozen=True)
 class Investigation:
     """State between two findings."""
 
@@ -145,6 +153,7 @@ class Investigation:
     setup_faults: tuple[SetupFault, ...] = ()
     notes: tuple[str, ...] = ()
     wider: TriedWider | None = None  # of the present fit or an earlier one; None: not tried yet
+    tried: TriedTrials | None = None  # of the last competition, which may be repeated under other options
     calibrations: int | None = None  # number of calibration errors among the given terms; None: none was found
 
     @property

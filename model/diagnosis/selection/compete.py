@@ -110,14 +110,16 @@ def compete(
     base: Fit,
     candidates: list[Candidate],
     progress: Callable[[str], None] = lambda text: None,
+    known: Sequence[Trial] = (),
 ) -> list[Trial]:
     """Fits of the candidates beside the present model, best evidence first.
 
+    known: trials of an earlier competition beside the same model, which are not fitted once more.
     Laws with names come first: an unnamed force is only fitted where it could still explain enough more than they do.
     """
     places = sorted({candidate.location for candidate in candidates})
     progress(f"fitting {len(candidates)} candidates at {', '.join(places)}")
-    trials = _initial_fits(problem, base, candidates)
+    trials = _initial_fits(problem, base, candidates, known)
     if not trials:
         return []
     leading, behind = _leading(problem, trials)
@@ -130,14 +132,17 @@ def compete(
     return _with_unconverged_refitted(problem, base, by_evidence(problem, base, [*named, *unnamed, *behind]))
 
 
-def _initial_fits(problem: Problem, base: Fit, candidates: list[Candidate]) -> list[Trial]:
+def _initial_fits(problem: Problem, base: Fit, candidates: list[Candidate], known: Sequence[Trial]) -> list[Trial]:
     """First fits of the candidates, best evidence first."""
+    fitted = {trial.candidate.term.key: trial.fit for trial in known}
     screened = problem.rules.screening
     most = max((candidate.strength(screened) for candidate in candidates), default=0.0)
     again = problem.rules.selection.again * most
     measured = MeasuredMotion.of(problem, base) if is_gross(problem, base) else None
 
     def initial_fit(own: Problem, candidate: Candidate) -> Trial | None:
+        if candidate.term.key in fitted:
+            return _trial(own, base, candidate, fitted[candidate.term.key])
         return _initial_fit(own, base, candidate, candidate.strength(screened) > again, measured)
 
     def fits(chosen: list[Candidate]) -> list[Trial]:
