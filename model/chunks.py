@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from typing import TypeVar
 
 import numpy as np
@@ -35,8 +36,10 @@ def share(work: Callable[[Piece], Result], pieces: Sequence[Piece], workers: int
     """Results in order; with more than one worker the pieces are shared among that many threads.
 
     torch's own threads should then be one (`torch.set_num_threads(1)`): its operations here are too small to split.
+    What the caller has set for its context, such as NumPy's handling of overflow, holds in the threads, too.
     """
     if workers > 1 and len(pieces) > 1:
+        contexts = [copy_context() for _ in pieces]
         with ThreadPoolExecutor(workers) as pool:
-            return list(pool.map(work, pieces))
+            return list(pool.map(lambda context, piece: context.run(work, piece), contexts, pieces))
     return [work(piece) for piece in pieces]
