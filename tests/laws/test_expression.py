@@ -106,3 +106,9 @@ def test_formulas_can_be_read_by_several_threads_at_once() -> None:
     finally:
         gc.callbacks.remove(yields)
         gc.set_threshold(*thresholds)
+
+
+def test_a_third_power_is_the_product_of_three() -> None:
+    d = np.array([-2.0, 0.0, 1.5])
+    assert np.array_equal(parse("d**3", frozenset({"d"}))(d=d), d * d * d)
+    assert parse("(d + 1)**3", frozenset({"d"}))(d=0.5) == 1.5**3

@@ -123,14 +123,17 @@ def changed_parts(state: Investigation) -> int:
 
 def _out_of_order(state: Investigation) -> int:
     """Number of masses and instruments that are off beyond their tolerances."""
-    return len(faulty(state)) if state.calibrations else 0
+    if state.calibrations:
+        return len(faulty(state))
+    return sum(found.trial.term.law.error_of_value for found in state.found)
 
 
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
     """Whether so many changes were found that they imitate another structure than the file's.
 
     More structural ones than a few in any case, more than one if they leave a significant error (`errors`).  Masses and
-    instruments off beyond their tolerances count, too, where they are most of all, or leave such an error.
+    instruments off beyond their tolerances count, too, where they are most of all, are beside more than one structural
+    change, or leave such an error.
     """
     rules, parts = state.options.rules.verdict, changed_parts(state)
     if errors is None or parts > rules.parts:
@@ -138,7 +141,9 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
     off = _out_of_order(state)
     share = errors.explained(rules)
     left = bool(np.any(errors.unexplained(rules) > 0)) and share is not None and share < 1 - rules.parts_leave
-    return 2 * off > (state.calibrations or 1) or (left and (parts > 1 or parts + off > rules.parts))
+    if (state.calibrations and 2 * off > state.calibrations) or (off > 0 and parts > 1):
+        return True
+    return left and (parts > 1 or parts + off > rules.parts)
 
 
 def bounded(state: Investigation) -> Noise:

@@ -34,6 +34,8 @@ def investigation(laws: list[str], moved: bool) -> Any:
         (["missing_connection", "suspended_mass"], False, 0.02, False),
         (["missing_connection", "suspended_mass"], False, 0.20, True),  # two that leave 6 % of the power
         (["missing_connection", "coulomb_friction"], False, 0.20, False),
+        (["missing_connection", "sensor_gain", "series_stiffness"], False, 0.02, True),  # what bending is imitated by
+        (["missing_connection", "sensor_gain"], False, 0.02, False),
     ],
 )
 def test_changes_of_the_structure_are_named_when_they_are_few(

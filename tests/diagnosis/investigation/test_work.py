@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
@@ -9,9 +10,10 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.diagnosis.fit.optimise import try_optimise
+from sprung.model.diagnosis.fit.optimise import optimise, try_optimise
 from sprung.model.diagnosis.investigation.state import share_done
 from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection import compete
 from sprung.model.work import WorkBudget
 from tests.diagnosis_cases import problem_of, quarter_car, simulate
@@ -66,3 +68,25 @@ def test_where_a_search_ends_does_not_depend_on_which_thread_is_first(monkeypatc
 def test_the_share_done_grows_with_every_finding_and_ends_before_the_conclusion() -> None:
     shares = [share_done(findings) for findings in (0, 0.5, 1, 2, 6, 20)]
     assert shares[0] == 0.25 and shares == sorted(shares) and shares[-1] < 0.93
+
+
+def test_a_portion_is_a_share_of_what_is_left_and_is_counted_with_the_rest() -> None:
+    work = WorkBudget(100.0, until=math.inf)
+    work.add(20.0)
+    part = work.portion(0.25)
+    assert part.most == 20.0 and part.until == work.until
+    part.add(30.0)  # the last piece of it may be larger than what was left
+    assert part.ended and not work.ended
+    work.gather([part])
+    assert work.done == 50.0
+
+
+def test_a_competition_repeated_beside_the_same_model_fits_nothing_again() -> None:
+    problem = problem_of(simulate(lambda d, v: 300.0 * np.tanh(v / 2e-3), seconds=8, seed=4))
+    base = optimise(problem, Point(np.zeros(len(problem.system.parameters)), (), np.zeros(4)))
+    best = sorted(screen(problem, base, problem.system.catalogue).candidates, key=lambda c: -c.score)[:3]
+    first = compete.compete(problem, base, best)
+    spent = replace(problem, work=WorkBudget(0.0))
+    again = compete.compete(spent, base, best, known=first)
+    assert len(first) > 1 and compete.compete(spent, base, best) == []
+    assert [(t.term.key, t.fit.chi_square) for t in again] == [(t.term.key, t.fit.chi_square) for t in first]
