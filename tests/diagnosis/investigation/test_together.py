@@ -36,6 +36,7 @@ class _Stand:
     refuted: bool = False
     options: Options = field(default_factory=Options)
     bounded: bool = False
+    tried: Any = None
 
     @property
     def fit(self) -> Any:
