@@ -190,6 +190,9 @@ class SelectionRules:
     hint: float = rule(0.02, "of a law's strength at which its first step is taken; chosen", 0.005, 0.1)
     still: float = rule(0.05, "of the fitted part's motion, below which nothing is judged; chosen", 0.02, 0.1)
     refuted: float = rule(3.0, "standard deviations; derived: one true finding in 700 is refuted", 2.0, 5.0)
+    closer: float = rule(
+        0.7, "of the error at every sensor, up to which nothing is refuted; derived: half of its power", 0.5, 0.85
+    )
 
 
 @dataclass(frozen=True)

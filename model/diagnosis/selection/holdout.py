@@ -51,13 +51,17 @@ class HeldOutComparison:
     apart: float  # distance of the two predictions, in units of noise
     scatter: float  # variance along it: noise, and an upper bound of the effect of the parameters' uncertainty
     chance: float = RULES.selection.refuted  # standard deviations beyond which the difference is significant
+    closer: bool = False  # whether the second is clearly closer to every sensor
 
     @property
     def refuted(self) -> bool:
         """Whether the second predicts significantly worse.
 
-        If it were true, its gain would be distributed about apart^2 with standard deviation 2 apart.
+        If it were true, its gain would be distributed about apart^2 with standard deviation 2 apart.  Where both are
+        far from noise, slow errors that are a small part of all weigh most: what is closer to all sensors is kept.
         """
+        if self.closer:
+            return False
         found: bool = self.gain < min(0.0, self.apart**2 - self.chance * 2 * self.apart * np.sqrt(self.scatter))
         return found
 
@@ -162,15 +166,18 @@ class HeldOut:
 
         With process noise, along the measured motion: unmeasured forces make any free run diverge from the measurement.
         """
+        closer = False
         if not before.noise.process_noise:
-            first, second = self._residuals(*self.runs(before.point, after.point))
+            runs = self.runs(before.point, after.point)
+            first, second = self._residuals(*runs)
             gain = float(first @ first - second @ second)
+            closer = bool(np.all(runs[1].per_sensor < self.rules.selection.closer * runs[0].per_sensor))
         else:
             (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
             logs = first_log_det, second_log_det
             gain = process_gain(first, second, self.later.sensors.shape[1], logs, self.rules.evidence)
         apart, scatter = float(np.linalg.norm(first - second)), self.signals.samples / self.split
-        return HeldOutComparison(gain, apart, scatter, self.rules.selection.refuted)
+        return HeldOutComparison(gain, apart, scatter, self.rules.selection.refuted, closer)
 
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
         """Whitened residual of the held-out part along the smoothed motion, and its log determinant."""

@@ -34,6 +34,11 @@ def test_what_is_false_and_far_enough_away_is_refuted(apart: float) -> None:
     assert np.mean([one.refuted for one in comparisons(apart, second_is_true=False)]) > 0.99
 
 
+def test_what_is_closer_to_every_sensor_is_not_refuted_by_slow_errors_far_from_noise() -> None:
+    far = HeldOutComparison(gain=-28250.0, apart=332.0, scatter=1.4)
+    assert far.refuted and not replace(far, closer=True).refuted
+
+
 def test_what_predicts_nearly_the_same_is_hardly_ever_refuted() -> None:
     assert np.mean([one.refuted for one in comparisons(0.05, second_is_true=False)]) < 4e-3
 
@@ -63,6 +68,8 @@ def test_other_values_are_refuted_and_near_ones_are_not(fitted: tuple[HeldOut, F
     assert held.compare(true, wrong).refuted
     assert not held.compare(wrong, true).refuted
     assert not held.compare(true, fit).refuted
+    assert held.compare(wrong, true).closer and not held.compare(true, wrong).closer
+    assert not held.compare(true, fit).closer
 
 
 def test_a_held_out_part_that_rests_decides_nothing(fitted: tuple[HeldOut, Fit]) -> None:
