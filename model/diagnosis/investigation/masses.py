@@ -12,7 +12,6 @@ from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.selection.compete import Trial, gain_together
 
 _STEPS = 6  # of the fit of all errors, from the present model
-_FIRST_STEPS, _HOPEFUL = 2, 0.5  # after as many, it has this share of the evidence to beat, or is given up
 
 
 def imitates_errors(state: Investigation, chosen: Trial) -> bool:
@@ -26,8 +25,4 @@ def imitates_errors(state: Investigation, chosen: Trial) -> bool:
     found = {term.key for term in state.fit.point.terms}
     errors = [term for term in calibration_terms(state) if term.key not in found]
     by_chance = state.options.rules.screening.per_freedom * len(errors)
-
-    def explained(steps: int) -> float:
-        return gain_together(state.problem, state.fit, errors, steps) - by_chance
-
-    return explained(_FIRST_STEPS) > _HOPEFUL * chosen.evidence and explained(_STEPS) > chosen.evidence
+    return gain_together(state.problem, state.fit, errors, _STEPS) - by_chance > chosen.evidence
