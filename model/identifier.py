@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 
 PRIOR_STD = 1.0  # of every log-ratio: nominal values are right within a factor e either way
@@ -21,6 +23,22 @@ class StageTimes:
 
     estimate: float = 0.0
     refine: float = 0.0
+
+
+def without_values(P: int, S: int) -> Estimate:
+    """The estimate of an uninformative window: P parameters as before it, S sensors of which it says nothing."""
+    return Estimate(
+        log_ratio=np.zeros(P),
+        covariance=np.eye(P) * PRIOR_STD**2,
+        identifiable=np.zeros(P, dtype=bool),
+        nrmse=float("nan"),
+        per_sensor=np.full(S, np.nan),
+        chi_square=1.0,
+        adequate=True,
+        converged=True,
+        iterations=0,
+        informative=False,
+    )
 
 
 class Identifies(Protocol):

@@ -17,7 +17,7 @@ from sprung.model.ambient.sensing import Sensing, sensing
 from sprung.model.ambient.speed import Track
 from sprung.model.ambient.transient import TransientFit, TransientWindow
 from sprung.model.ambient.window import LOAD_STD, AmbientFit, WindowFit
-from sprung.model.identifier import PRIOR_STD, StageTimes, UnusableWindow
+from sprung.model.identifier import PRIOR_STD, StageTimes, UnusableWindow, without_values
 from sprung.model.schema import Body
 from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System
@@ -102,7 +102,7 @@ class AmbientIdentifier(_WindowByWindow):
         fit = self.fit(values, start)
         present = np.asarray(np.isfinite(values[:, len(self.system.inputs) :]).all(axis=0))
         P = len(self.system.parameters)
-        return _silent(P, len(present)) if fit is None else as_estimate(fit, P, present, self.rules)
+        return without_values(P, len(present)) if fit is None else as_estimate(fit, P, present, self.rules)
 
 
 class OutputOnlyIdentifier(_WindowByWindow):
@@ -120,7 +120,7 @@ class OutputOnlyIdentifier(_WindowByWindow):
         sensors, P = np.flatnonzero(present), len(self.system.parameters)
         fit = self.window.fit(values[:, sensors], sensors, start) if len(sensors) else None
         if fit is None:
-            return _silent(P, len(present))
+            return without_values(P, len(present))
         if not fit.adequate:
             coloured = self.coloured.fit(values, start)
             if coloured is not None:
@@ -184,22 +184,6 @@ def as_estimate(fit: AmbientFit, P: int, present: BoolArray, rules: AmbientWindo
         iterations=fitted.iterations,
         informative=bool(identifiable.any() or not fits),
         running=bool(fits and not identifiable.any()),
-    )
-
-
-def _silent(P: int, sensors: int) -> Estimate:
-    """The estimate of an uninformative window."""
-    return Estimate(
-        log_ratio=np.zeros(P),
-        covariance=np.eye(P) * PRIOR_STD**2,
-        identifiable=np.zeros(P, dtype=bool),
-        nrmse=float("nan"),
-        per_sensor=np.full(sensors, np.nan),
-        chi_square=1.0,
-        adequate=True,
-        converged=True,
-        iterations=0,
-        informative=False,
     )
 
 

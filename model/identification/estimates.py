@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sprung.model.identification.faults import fit_limit
 from sprung.model.identification.refine import Refined
-from sprung.model.identifier import PRIOR_STD
+from sprung.model.identifier import without_values
 from sprung.model.signals import Deviating, Estimate, FloatArray
 
 EXCITED = 20.0  # power of an input over its noise; below, what sensors show is not the response to the inputs
@@ -57,16 +59,12 @@ def estimates(
 
 def not_identified(P: int, S: int, reason: str) -> Estimate:
     """That of a window of P parameters and S sensors that has no values, for a reason."""
-    return Estimate(
-        log_ratio=np.zeros(P),
-        covariance=np.eye(P) * PRIOR_STD**2,
-        identifiable=np.zeros(P, dtype=bool),
-        nrmse=float("nan"),
-        per_sensor=np.full(S, np.nan),
+    return replace(
+        without_values(P, S),
         chi_square=float("nan"),
         adequate=False,
         converged=False,
-        iterations=0,
+        informative=True,
         identified=False,
         reason=reason,
     )
