@@ -237,8 +237,10 @@ class Identifier:
 
     def _begin(self, windows: FloatArray, workers: int, loads: bool) -> FloatArray | None:
         """The estimator's start; nominal values for windows that lack inputs, None where all of them do."""
-        whole = ~np.isnan(windows[:, :, : len(self.system.inputs)]).any(axis=(1, 2))
-        if self.estimator is None or not whole.any():
+        if self.estimator is None:
+            return None
+        whole = ~self._refiner(windows.shape[1]).lacks(windows).any(axis=1)
+        if not whole.any():
             return None
         found = self.estimator.start(windows[whole], workers, loads=loads)
         if whole.all():
