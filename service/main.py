@@ -19,8 +19,8 @@ from typing import NoReturn
 from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
+from sprung.service.access.notice import access_notice, announce_access, is_loopback
 from sprung.service.access.tokens import Tokens
-from sprung.service.api.guard import is_loopback
 from sprung.service.api.server import make_server
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
@@ -99,21 +99,6 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         server.run(sockets=[listening])
 
 
-def access_notice(settings: Settings, tokens: bool) -> str:
-    """What to say about a service that asks for no token; empty where it does.  Raises UserError where that is not
-    wanted."""
-    if settings.open:
-        return "requests need no token, as SPRUNG_OPEN says: whoever reaches this address may do anything"
-    if tokens:
-        return ""
-    if not is_loopback(settings.host):
-        raise UserError(
-            f"{settings.host} can be reached by others, and there is no token: make one with `sprung token create`, "
-            "set SPRUNG_ADMIN_TOKEN, or say SPRUNG_OPEN=true behind a proxy that asks for sign-in"
-        )
-    return "requests need no token, as only this machine reaches the address; `sprung token create` changes that"
-
-
 def check_access(settings: Settings) -> None:
     """Before anything is loaded: raises UserError for a service that others reach and that asks for no token."""
     if settings.open or settings.admin_token is not None or settings.oidc_issuer or is_loopback(settings.host):
@@ -124,11 +109,6 @@ def check_access(settings: Settings) -> None:
             access_notice(settings, Tokens(store).any)
         finally:
             store.close()
-
-
-def announce_access(notice: str) -> None:
-    """One line on stderr."""
-    print(f"sprung: {notice}", file=sys.stderr, flush=True)
 
 
 def _exit(_number: int, _frame: FrameType | None) -> NoReturn:

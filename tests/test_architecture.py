@@ -119,6 +119,8 @@ LATE_OUTSIDE = {
     "service/cli/": "a command loads what it needs when it is called: `--help` is there in a tenth of a second",
     "service/monitoring/engine.py": "torch, which processes that are forked before it may not have loaded",
     "service/monitoring/simulated.py": "torch, the same",
+    "service/fleet/ray_replicas.py": "torch, in replicas: who starts them starts Ray's own processes first",
+    "service/api/ray_serving.py": "torch and FastAPI, in the door's replica alone",
     "service/diagnosis/worker.py": "threads of linear algebra are bounded before it is loaded",
 }
 CORE_KNOWS = {"numpy", "scipy", "torch", "torchdiffeq", "pydantic", "pydantic_core", "yaml", "safetensors"}

@@ -19,6 +19,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from sprung.service.access.notice import is_loopback
 from sprung.service.access.oidc import AGAIN_SECONDS, Provider, Unreachable, looks_like_jwt
 from sprung.service.access.tokens import Actor, Refused, Tokens, digest_of
 from sprung.service.api.clients import client_of
@@ -316,14 +317,6 @@ def host_of(header: str) -> str:
     if found is None:
         raise ApiProblem(400, "the Host header is no name or address with or without a port")
     return (found[1] or found[2] or "").lower()
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is reached from this machine only."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
 
 
 @lru_cache(maxsize=100)

@@ -23,8 +23,8 @@ from sprung.service.api.guard import Guard
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.problems import ApiProblem
 from sprung.service.errors import Busy
-from sprung.service.fleet.ingest import IngestResult, OtherModel, read_messages
-from sprung.service.fleet.message import SentWindows
+from sprung.service.fleet.ingest import OtherModel, read_messages
+from sprung.service.fleet.message import IngestResult, SentWindows
 from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 from sprung.service.store import Store

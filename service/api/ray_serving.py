@@ -6,26 +6,16 @@ replica that dies loses only unacknowledged requests, which their senders repeat
 
 from __future__ import annotations
 
-import asyncio
 import http.client
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from sprung.model.signals import Estimate, FloatArray
-from sprung.service.api.live_ingest import ingest_app
-from sprung.service.errors import Busy, UserError
-from sprung.service.fleet.ingest import IngestResult, read_messages
-from sprung.service.fleet.message import Message, SentWindows, WindowEstimate
+from sprung.service.errors import UserError
 from sprung.service.fleet.ray_head import RayHead
 from sprung.service.fleet.ray_replicas import FoldReplica, IdentifyReplica
-from sprung.service.monitoring.engine import load_engine
+from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
 
@@ -37,88 +27,6 @@ PROBE_SECONDS = 0.5
 PROBE_TIMEOUT = 10.0  # s: a machine that is busy answers late
 SILENT_SECONDS = 10.0  # without an answer
 ABANDON_SECONDS = 10.0
-
-
-@dataclass(frozen=True, slots=True)
-class ServingSizes:
-    """How much, at most."""
-
-    replicas: int = 8  # of each of the two that compute
-    least: int = 1  # of these; with two, one that dies is not missed
-    more_after_seconds: float = 10.0  # of more requests than they should have
-    fewer_after_seconds: float = 120.0  # of fewer: one that starts imports for seconds
-    cores: float = 1.0  # of a replica that identifies
-    batch_windows: int = 32
-    batch_messages: int = 64
-    batch_wait_seconds: float = 0.02
-    queued: int = 256  # requests for each replica that wait; more are 429
-
-
-class RayBehind:
-    """What the door sees of the two.  Requests are put together here: a call costs more than a window's identification,
-    so that one carries the windows, or the messages, of all that ask at a time."""
-
-    def __init__(self, identify: Any, fold: Any, digest: str, sizes: ServingSizes, batch: Callable[..., Any]) -> None:
-        """identify, fold: handles of the deployments; batch: `serve.batch`, which runs in a replica only."""
-        self._identify = identify
-        self._fold = fold
-        self._digest = digest
-        self._waiting, self._most = 0, sizes.queued * sizes.replicas
-        # one more than there are replicas, so that none waits for the next; more, and batches stay small
-        wait = {"batch_wait_timeout_s": sizes.batch_wait_seconds, "max_concurrent_batches": sizes.replicas + 1}
-        self._identified = batch(max_batch_size=sizes.batch_windows, **wait)(self._identify_together)
-        self._folded = batch(max_batch_size=sizes.batch_messages, **wait)(self._fold_together)
-
-    async def fold(self, body: bytes) -> IngestResult:
-        """Fold a message."""
-        with self._place():
-            return await self._fold_one((await asyncio.to_thread(read_messages, [body]))[0])
-
-    async def identify_and_fold(self, sent: SentWindows) -> IngestResult:
-        """Identify windows, together with those of others, and fold them together."""
-        with self._place():
-            ways = [self._identified(one) for one in zip(sent.starts, sent.values, strict=True)]
-            estimates: list[Estimate] = await asyncio.gather(*ways)
-            found = zip(sent.starts, estimates, strict=True)
-            windows = tuple(WindowEstimate(start, "used", None, 0, False, estimate) for start, estimate in found)
-            return await self._fold_one(Message(sent.vehicle, self._digest, windows))
-
-    @contextmanager
-    def _place(self) -> Iterator[None]:
-        """One of those who wait.  Raises Busy when there are too many."""
-        if self._waiting >= self._most:
-            raise Busy("too many requests wait; try again in a second")
-        self._waiting += 1
-        try:
-            yield
-        finally:
-            self._waiting -= 1
-
-    async def _fold_one(self, message: Message) -> IngestResult:
-        taken: IngestResult | UserError = await self._folded(message)
-        if isinstance(taken, UserError):
-            raise taken
-        return taken
-
-    async def _identify_together(self, asked: list[tuple[int, FloatArray]]) -> list[Estimate]:
-        starts, values = [start for start, _ in asked], np.stack([values for _, values in asked])
-        found: list[Estimate] = await _asked(self._identify.identify.remote(starts, values))
-        return found
-
-    async def _fold_together(self, messages: list[Message]) -> list[IngestResult | UserError]:
-        found: list[IngestResult | UserError] = await _asked(self._fold.fold.remote(messages))
-        return found
-
-
-async def _asked(pending: Any) -> Any:
-    from ray.exceptions import RayError, RayTaskError
-
-    try:
-        return await pending
-    except RayTaskError as error:
-        raise error.cause from None
-    except RayError as error:  # another one takes its place
-        raise Busy(f"a replica ended with the request in its hands ({type(error).__name__}); try again") from error
 
 
 def application(settings: Settings, sizes: ServingSizes) -> Any:
@@ -145,7 +53,11 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
     fold = deployment(FoldReplica, name="fold", ray_actor_options={"num_cpus": sizes.cores / 2}, **shared)
 
     def build() -> Any:
-        """The door's ASGI application; runs in its replica."""
+        """The door's ASGI application; runs in its replica, and what it needs is imported there alone."""
+        from sprung.service.api.live_ingest import ingest_app
+        from sprung.service.fleet.ray_behind import RayBehind
+        from sprung.service.monitoring.engine import load_engine
+
         engine = load_engine(settings)
         behind = RayBehind(
             serve.get_deployment_handle("identify", APPLICATION),

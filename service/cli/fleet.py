@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import sys
-import threading
 import time
 from collections import Counter
 from contextlib import ExitStack, closing
@@ -16,9 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from sprung.model.text import counted
-from sprung.service.access.tokens import Tokens
-from sprung.service.api import ray_serving
-from sprung.service.api.ray_serving import ServingSizes
 from sprung.service.cli.options import time_of
 from sprung.service.cli.targets import check_folder
 from sprung.service.errors import UserError
@@ -29,7 +25,6 @@ from sprung.service.fleet.kafka_broker import open_kafka
 from sprung.service.fleet.many import diagnose_many
 from sprung.service.fleet.nats_broker import NatsBroker, ack_seconds, without_password
 from sprung.service.fleet.tasks import tasks_for
-from sprung.service.main import access_notice, announce_access
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import load_engine
 from sprung.service.monitoring.pipeline import Pipeline
@@ -122,26 +117,6 @@ def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, worker
         by_verdict = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
         print(f"{by_verdict}; {before} of them done before; {seconds:.0f} s on {tasks.name}; reports in {out}")
     return 0 if set(verdicts) == {"consistent"} else 1
-
-
-def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None, workers: int | None) -> int:
-    """Serve until stopped."""
-    settings = settings_with(options)
-    with closing(open_store(settings.store_url)) as store:  # migrated once, before replicas start
-        notice = access_notice(settings, Tokens(store).any)
-    head = ray_serving.start(settings, sizes, settings.host, settings.port, address, workers)
-    if notice:
-        announce_access(notice)
-    print(f"Sprung takes windows and estimates on http://{settings.host}:{settings.port}; Ctrl-C stops", flush=True)
-    stopping = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stopping.set())
-    if ray_serving.watch(stopping, settings.host, settings.port, head):
-        ray_serving.stop(head)
-        return 0
-    print("sprung: Ray Serve does not answer any more; start this command again", file=sys.stderr, flush=True)
-    ray_serving.abandon(head)
-    os._exit(1)  # Ray's threads wait for a head that is gone
 
 
 def run_consume(options: dict[str, Any], address: str, alive: Path | None) -> int:

@@ -146,8 +146,8 @@ def serve(
     POST /ingest/estimates and /ingest/windows, identified in batches, folded into one store.
     """
     one_thread_each()
-    from sprung.service.api.ray_serving import ServingSizes
-    from sprung.service.cli.fleet import run_serve
+    from sprung.service.cli.fleet_serve import run_serve
+    from sprung.service.fleet.serving_sizes import ServingSizes
 
     options = {"system": system, "weights": weights, "store": store, "host": host, "port": port}
     return run_serve(options, ServingSizes(replicas=replicas, least=least, cores=cores), ray_address, workers)

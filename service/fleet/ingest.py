@@ -17,7 +17,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import UserError
-from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
+from sprung.service.fleet.message import IngestResult, Message, UnreadableMessage, WindowEstimate, decode, encode
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import FoldedWindows, HeldVehicle, WindowsToFold
@@ -35,16 +35,6 @@ CONTIGUOUS = 1.01  # hops: a window that begins so long after the last one follo
 
 class OtherModel(UserError):
     """Estimates of another system file or estimator than this service has."""
-
-
-@dataclass(frozen=True, slots=True)
-class IngestResult:
-    """What became of one message."""
-
-    vehicle: str
-    folded: int  # windows that were tracked or counted now
-    waiting: int  # of the message, kept until the gap before them is filled or given up
-    known: int  # that were there before
 
 
 class Ingest:

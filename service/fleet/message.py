@@ -88,6 +88,16 @@ class WindowEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class IngestResult:
+    """What became of one message."""
+
+    vehicle: str
+    folded: int  # windows that were tracked or counted now
+    waiting: int  # of the message, kept until the gap before them is filled or given up
+    known: int  # that were there before
+
+
+@dataclass(frozen=True, slots=True)
 class SentWindows:
     """Windows of one vehicle that are to be identified where they arrive."""
 

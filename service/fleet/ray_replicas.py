@@ -1,4 +1,8 @@
-"""What computes behind the door of Ray Serve.  Imports no more than it needs: that is most of a replica's start."""
+"""What computes behind the door of Ray Serve.
+
+Whoever starts the replicas imports these classes, too, and should not wait for torch before Ray's own processes start:
+what they compute with is imported where a replica begins.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +11,7 @@ from collections.abc import Sequence
 
 from sprung.model.signals import Estimate, FloatArray
 from sprung.service.errors import UserError
-from sprung.service.fleet.ingest import Ingest, IngestResult
-from sprung.service.fleet.message import Message
-from sprung.service.monitoring.compute import Compute
-from sprung.service.monitoring.engine import load_engine
-from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.fleet.message import IngestResult, Message
 from sprung.service.processes.threads import one_thread_each
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
@@ -22,6 +22,8 @@ class IdentifyReplica:
 
     def __init__(self, settings: Settings) -> None:
         one_thread_each()
+        from sprung.service.monitoring.engine import load_engine
+
         self._engine = load_engine(settings)
 
     async def identify(self, starts: list[int], values: FloatArray) -> list[Estimate]:
@@ -34,6 +36,11 @@ class FoldReplica:
 
     def __init__(self, settings: Settings) -> None:
         one_thread_each()
+        from sprung.service.fleet.ingest import Ingest
+        from sprung.service.monitoring.compute import Compute
+        from sprung.service.monitoring.engine import load_engine
+        from sprung.service.monitoring.pipeline import Pipeline
+
         store = open_store(settings.store_url)
         pipeline = Pipeline(load_engine(settings), store, Compute(1), vehicles_in_memory=settings.vehicles_in_memory)
         self._ingest = Ingest(pipeline, settings.late_seconds)

@@ -111,6 +111,7 @@ def start_ray(cores: int | None, config: dict[str, Any] | None = None) -> None:
     """
     import ray
 
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use to its makers otherwise
     logging.getLogger("ray").setLevel(logging.ERROR)
     ray.init(
         num_cpus=cores,

@@ -15,15 +15,16 @@ from fastapi.testclient import TestClient
 from pydantic import SecretStr
 
 from sprung.model.system import System
+from sprung.service.access.notice import access_notice, is_loopback
 from sprung.service.access.tokens import Refused, Tokens
-from sprung.service.api.guard import COOKIE, Limiter, is_loopback
+from sprung.service.api.guard import COOKIE, Limiter
 from sprung.service.api.problems import ApiProblem
 from sprung.service.api.scopes import NEEDS, need_of
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import MEDIA_TYPE, Message, WindowEstimate, encode
-from sprung.service.main import Feeds, access_notice, serve
+from sprung.service.main import Feeds, serve
 from sprung.service.monitoring.engine import Engine
 from sprung.service.observability.logs import JsonLines, PlainLines, request_id
 from sprung.service.settings import Settings

@@ -13,8 +13,8 @@ from fastapi.testclient import TestClient
 from sprung.model.system import System
 from sprung.service.api.live_ingest import ingest_app
 from sprung.service.errors import Busy
-from sprung.service.fleet.ingest import Ingest, IngestResult, read_messages
-from sprung.service.fleet.message import MEDIA_TYPE, Message, SentWindows, WindowEstimate, encode
+from sprung.service.fleet.ingest import Ingest, read_messages
+from sprung.service.fleet.message import MEDIA_TYPE, IngestResult, Message, SentWindows, WindowEstimate, encode
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sprung.service.api.ray_serving import RayBehind, ServingSizes
 from sprung.service.errors import Busy, UserError
-from sprung.service.fleet.ingest import IngestResult
-from sprung.service.fleet.message import Message, SentWindows
+from sprung.service.fleet.message import IngestResult, Message, SentWindows
+from sprung.service.fleet.ray_behind import RayBehind
+from sprung.service.fleet.serving_sizes import ServingSizes
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, when it is imported

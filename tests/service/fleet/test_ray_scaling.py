@@ -13,7 +13,8 @@ import pytest
 
 from sprung.model.system import System
 from sprung.service.api import ray_serving
-from sprung.service.api.ray_serving import APPLICATION, ServingSizes
+from sprung.service.api.ray_serving import APPLICATION
+from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import Settings
 
 serve: Any = pytest.importorskip("ray.serve")

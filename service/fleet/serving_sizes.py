@@ -1,0 +1,20 @@
+"""How large the ingest on Ray Serve becomes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class ServingSizes:
+    """How much, at most."""
+
+    replicas: int = 8  # of each of the two that compute
+    least: int = 1  # of these; with two, one that dies is not missed
+    more_after_seconds: float = 10.0  # of more requests than they should have
+    fewer_after_seconds: float = 120.0  # of fewer: one that starts imports for seconds
+    cores: float = 1.0  # of a replica that identifies
+    batch_windows: int = 32
+    batch_messages: int = 64
+    batch_wait_seconds: float = 0.02
+    queued: int = 256  # requests for each replica that wait; more are 429
