@@ -125,6 +125,9 @@ class ScreeningRules:
     reach: int = rule(24, "bins; derived: a median of 49 knows the level to 18 %", 12, 48)
     colour: float = rule(2.5, "by which exact columns may raise a score; chosen", 1.5, 4.0)
     per_freedom: float = rule(2.0, "score of every further parameter; derived: Akaike's", 1.0, 4.0)
+    of_laws: float = rule(
+        0.5, "of the chance of a false finding, for laws at elements; chosen: they are looked for first", 0.1, 0.7
+    )
     of_shapes: float = rule(4.0, "score by chance, of the shapes of an unnamed force; derived: 2 log 7", 2.0, 6.0)
     of_places: float = rule(9.0, "the same of the places of a missing part; derived: 2 log 100", 7.0, 12.0)
     of_lines: float = rule(22.0, "the same of frequencies and phases; derived: 2 log 60 000", 18.0, 26.0)

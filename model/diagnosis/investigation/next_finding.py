@@ -41,6 +41,7 @@ from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.along_measured import sharpened
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
+from sprung.model.diagnosis.selection.evidence import chance_on_whole
 from sprung.model.diagnosis.selection.plausible import doubt, hardly_there
 
 _FITTED, _CHECKED = 0.5, 0.7  # of one finding's work
@@ -131,7 +132,8 @@ def _candidates(state: Investigation) -> list[Candidate]:
     screening = without_calibrations(state)
     # what is not sought sets no scale for the others
     screening = replace(screening, candidates=tuple(sought(state, screening.candidates)))
-    return untried(state, shortlist(screening, rules.acceptance.alpha, options.multiplicity, rules, gross=gross))
+    chosen = shortlist(screening, rules.acceptance.alpha, options.multiplicity, rules, gross=gross, whole=_whole(state))
+    return untried(state, chosen)
 
 
 def _competition(
@@ -185,8 +187,18 @@ def _is_acceptable(state: Investigation, trial: Trial) -> bool:
 
 def _p_value(state: Investigation, chosen: Trial) -> float:
     """Chance of the chosen trial under noise alone, by its fit and by its score, corrected for all tests."""
-    tests = state.last.tried(chosen.candidate.family) if state.options.multiplicity else 1
-    return max(chosen.p_value(tests), min(1.0, chosen.candidate.p_single * tests))
+    candidate, alpha = chosen.candidate, state.options.rules.acceptance.alpha
+    tests = state.last.tried(candidate.family) if state.options.multiplicity else 1
+    gains = [(chosen.gain, chosen.freedom), (candidate.score, candidate.freedom)]
+    held = state.held
+    return chance_on_whole(gains, tests, alpha, _whole(state), lambda: held.compare(state.fit, chosen.fit).evidence)
+
+
+def _whole(state: Investigation) -> float:
+    """Length of the recording over that of its fitted part; 1 where the held-out part is not asked, or says little."""
+    if not state.options.held_out or state.held.still or state.problem.process_noise:
+        return 1.0
+    return state.held.signals.samples / state.held.split
 
 
 def _is_refuted(state: Investigation, chosen: Trial) -> bool:

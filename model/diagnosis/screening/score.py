@@ -21,7 +21,7 @@ from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, ScreeningRules
-from sprung.model.diagnosis.screening.families import Family
+from sprung.model.diagnosis.screening.families import ELEMENT, Family
 from sprung.model.signals import FloatArray
 
 MEDIAN_OF_CHI_SQUARE = 1.386  # with two degrees of freedom
@@ -67,10 +67,15 @@ class Screening:
 
     candidates: tuple[Candidate, ...]  # the best shape of every law at every place
     tests: dict[Family, int]  # number of tests
+    of_laws: float = RULES.screening.of_laws  # share of the chance of a false finding, for laws at elements
 
     def tried(self, family: Family) -> int:
-        """Bonferroni's number: tests of the family, times the families."""
-        return self.tests[family] * len(self.tests)
+        """Bonferroni's number: tests of the family, over its share of the chance of a false finding."""
+        others = len(self.tests) - 1
+        if others < 1 or ELEMENT not in self.tests:
+            return self.tests[family] * len(self.tests)
+        share = self.of_laws if family is ELEMENT else (1 - self.of_laws) / others
+        return round(self.tests[family] / share)
 
     def p_value(self, candidate: Candidate) -> float:
         """p-value, corrected for multiple testing."""

@@ -36,4 +36,4 @@ def _screened(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool) 
             if candidate.score > 0:
                 found.append(candidate)
     found.sort(key=lambda one: (one.p_single, -one.score))
-    return Screening(tuple(found), tests or {ELEMENT: 1})
+    return Screening(tuple(found), tests or {ELEMENT: 1}, problem.rules.screening.of_laws)

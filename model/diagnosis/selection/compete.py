@@ -59,10 +59,6 @@ class Trial:
     def named(self) -> bool:
         return self.term.law.named
 
-    def p_value(self, tests: int) -> float:
-        """Probability of such a gain under noise alone among `tests` candidates, noise levels unknown."""
-        return chance(self.gain, self.freedom, tests)
-
     def delta_bic(self) -> float:
         """BIC with the candidate less BIC without."""
         return bic(self.gain, len(self.term.parameters), self.fit.count)
@@ -75,13 +71,18 @@ def shortlist(
     rules: Rules = RULES,
     *,
     gross: bool = False,
+    whole: float = 1.0,
 ) -> list[Candidate]:
     """Significant candidates that could be the best, one per law, place and variant; no faults of input channels.
+
+    whole: length of the recording over that of its fitted part.  Significant is what would be so on the whole recording
+    if the rest of it showed as much: whether it does is asked of the rest, once it is fitted.
 
     gross: whether the model's motion is far from the measured one.  Scores then indicate the place, but not which of
     an element's laws acts there: a law that yields permanently has little effect along a motion without yielding.
     """
-    good = [h for h in screening.candidates if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
+    tests = {family: screening.tried(family) if multiplicity else 1 for family in screening.tests}
+    good = [h for h in screening.candidates if chance(whole * h.score, h.freedom, tests[h.family]) <= alpha]
     if not good:
         return []
     good.sort(key=lambda h: h.strength(rules.screening), reverse=True)

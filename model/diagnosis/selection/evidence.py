@@ -19,7 +19,7 @@ a shape parameter without influence costs nothing, whereas BIC would charge log 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import stats
@@ -144,6 +144,28 @@ def unusual_cost(relative: float, usual: tuple[float, float], rules: EvidenceRul
 def chance(gain: float, freedom: int, tests: int) -> float:
     """Probability of such a gain under noise alone among `tests` candidates (Wilks, Bonferroni)."""
     return float(min(1.0, tests * stats.chi2.sf(max(gain, 0.0), max(1, freedom))))
+
+
+def chance_on_whole(
+    gains: Sequence[tuple[float, int]], tests: int, alpha: float, whole: float, rest: Callable[[], float]
+) -> float:
+    """Chance of gains on the fitted part; if the whole recording could settle what that part does not, of the whole.
+
+    The noise of the two parts is independent, so their log-likelihood ratios add up.  Values of a candidate that is
+    chance predict the rest worse than without it.
+
+    gains: each with its degrees of freedom, all of which have to be unlikely.
+    whole: length of the recording over that of the fitted part.
+    rest: the gain on the rest, with the values of the fitted part; called only if it could matter.
+    """
+
+    def of(factor: float, more: float) -> float:
+        return max(chance(factor * gain + more, freedom, tests) for gain, freedom in gains)
+
+    fitted = of(1.0, 0.0)
+    if fitted <= alpha or of(whole, 0.0) > alpha:
+        return fitted
+    return of(1.0, rest())
 
 
 def bic(gain: float, parameters: int, count: int) -> float:

@@ -19,7 +19,7 @@ from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_sta
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.time_stepping import march_from, march_from_rest
 from sprung.model.diagnosis.rules import RULES, Rules
-from sprung.model.diagnosis.selection.evidence import process_gain
+from sprung.model.diagnosis.selection.evidence import process_gain, profile_gain
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
@@ -48,6 +48,7 @@ class HeldOutComparison:
     """Comparison of two fits on the held-out part."""
 
     gain: float  # of the second, as twice the log-likelihood ratio
+    evidence: float  # the same, but no more than with the noise level of every block profiled out
     apart: float  # distance of the two predictions, in units of noise
     scatter: float  # variance along it: noise, and an upper bound of the effect of the parameters' uncertainty
     chance: float = RULES.selection.refuted  # standard deviations beyond which the difference is significant
@@ -171,13 +172,19 @@ class HeldOut:
             runs = self.runs(before.point, after.point)
             first, second = self._residuals(*runs)
             gain = float(first @ first - second @ second)
+            evidence = min(gain, self._profile_gain(first, second))
             closer = bool(np.all(runs[1].per_sensor < self.rules.selection.closer * runs[0].per_sensor))
         else:
             (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
             logs = first_log_det, second_log_det
-            gain = process_gain(first, second, self.later.sensors.shape[1], logs, self.rules.evidence)
+            gain = evidence = process_gain(first, second, self.later.sensors.shape[1], logs, self.rules.evidence)
         apart, scatter = float(np.linalg.norm(first - second)), self.signals.samples / self.split
-        return HeldOutComparison(gain, apart, scatter, self.rules.selection.refuted, closer)
+        return HeldOutComparison(gain, evidence, apart, scatter, self.rules.selection.refuted, closer)
+
+    def _profile_gain(self, before: FloatArray, after: FloatArray) -> float:
+        """Gain of one whitened residual over another, noise levels unknown."""
+        rules = self.rules.evidence
+        return profile_gain(before, after, self.later.sensors.shape[1], rules.quiet, rules)
 
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
         """Whitened residual of the held-out part along the smoothed motion, and its log determinant."""

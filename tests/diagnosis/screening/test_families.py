@@ -47,9 +47,18 @@ def test_searched_frequencies_make_a_score_count_for_less() -> None:
 
 def test_chances_are_multiplied_by_what_was_tried() -> None:
     one = candidate(20.0, ELEMENT)
-    screening = Screening((one,), {ELEMENT: 50, SENSOR: 10})
+    screening = Screening((one,), {ELEMENT: 50, SENSOR: 10}, of_laws=0.5)
     assert screening.p_value(one) == pytest.approx(one.p_single * 100)
     assert screening.tried(SENSOR) == 20
+
+
+def test_laws_at_elements_have_a_share_of_the_chance_and_the_other_families_equal_ones() -> None:
+    families = {ELEMENT: 60, SENSOR: 10, LINE: 30}
+    screening = Screening((), families, of_laws=0.6)
+    assert [screening.tried(family) for family in families] == [100, 50, 150]
+    spent = sum(tests / screening.tried(family) for family, tests in families.items())
+    assert spent == pytest.approx(1.0)  # Bonferroni's inequality: the chances of all families add up to the whole
+    assert Screening((), {SENSOR: 10, LINE: 30}).tried(LINE) == 60
 
 
 def test_an_anti_roll_bar_goes_between_left_and_right_and_nothing_is_a_pair_on_a_quarter_car() -> None:

@@ -10,6 +10,7 @@ from sprung.model.diagnosis.selection.evidence import (
     block_edges,
     bounded_gain,
     chance,
+    chance_on_whole,
     effective_count,
     level_gain,
     monotone_gains,
@@ -95,6 +96,39 @@ def test_chance_is_uniform_for_noise() -> None:
     values = [chance(float(x), 2, 1) for x in random.chisquare(2, 4000)]
     assert np.mean(np.array(values) < 0.1) == pytest.approx(0.1, abs=0.02)
     assert chance(-5.0, 1, 100) == 1.0
+
+
+def test_the_whole_recording_settles_what_its_fitted_part_does_not() -> None:
+    """One amplitude, estimated on 0.7 of a recording, then predicts the rest; true: 0 or 3.4 deviations."""
+    alpha, draws, share = 0.003, 40_000, np.array([0.7, 0.3])
+    random = np.random.default_rng(5)
+    found = {}
+    for snr in (0.0, 3.4):
+        product = snr * share + np.sqrt(share) * random.standard_normal((draws, 2))  # column with residual
+        estimate = product[:, 0] / share[0]
+        gain = estimate**2 * share[0]
+        rest = 2 * estimate * product[:, 1] - estimate**2 * share[1]
+        on_part = np.array([chance(float(one), 1, 1) for one in gain])
+        on_whole = np.array(
+            [
+                chance_on_whole([(float(g), 1)], 1, alpha, 1 / share[0], lambda r=float(r): r)
+                for g, r in zip(gain, rest, strict=True)
+            ]
+        )
+        found[snr] = float(np.mean(on_part <= alpha)), float(np.mean(on_whole <= alpha))
+    assert found[0.0][0] == pytest.approx(alpha, rel=0.25)
+    assert found[0.0][1] < 2 * alpha  # two chances to exceed the threshold, of which the second is seldom taken
+    assert found[3.4][1] > found[3.4][0] + 0.1
+
+
+def test_the_rest_is_asked_only_where_it_could_matter() -> None:
+    def unasked() -> float:
+        raise AssertionError("asked")
+
+    assert chance_on_whole([(30.0, 1)], 10, 1e-3, 1.4, unasked) < 1e-6
+    assert chance_on_whole([(5.0, 1)], 10, 1e-3, 1.4, unasked) > 0.1
+    assert chance_on_whole([(20.0, 1)], 100, 1e-3, 1.0, lambda: 20.0) == pytest.approx(chance(20.0, 1, 100))
+    assert chance_on_whole([(17.0, 1)], 100, 1e-3, 1.4, lambda: 8.0) == pytest.approx(chance(25.0, 1, 100))
 
 
 def test_what_repeats_itself_counts_once() -> None:

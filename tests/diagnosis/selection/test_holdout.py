@@ -20,7 +20,7 @@ def comparisons(apart: float, second_is_true: bool, number: int = 4000) -> list[
     noise = random.standard_normal((number, bins))
     first, second = (noise + difference, noise) if second_is_true else (noise, noise + difference)
     gains = np.sum(first**2, axis=1) - np.sum(second**2, axis=1)
-    return [HeldOutComparison(float(gain), apart, 1.0) for gain in gains]
+    return [HeldOutComparison(float(gain), float(gain), apart, 1.0) for gain in gains]
 
 
 @pytest.mark.parametrize("apart", [0.5, 3.0, 8.0, 30.0])
@@ -35,7 +35,7 @@ def test_what_is_false_and_far_enough_away_is_refuted(apart: float) -> None:
 
 
 def test_what_is_closer_to_every_sensor_is_not_refuted_by_slow_errors_far_from_noise() -> None:
-    far = HeldOutComparison(gain=-28250.0, apart=332.0, scatter=1.4)
+    far = HeldOutComparison(gain=-28250.0, evidence=-28250.0, apart=332.0, scatter=1.4)
     assert far.refuted and not replace(far, closer=True).refuted
 
 

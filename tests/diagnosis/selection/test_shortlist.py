@@ -24,3 +24,12 @@ def test_all_laws_of_the_leading_element_are_fitted_where_little_is_explained(gr
     chosen = shortlist(Screening(tuple(candidates), {ELEMENT: 100}), alpha=1e-3, gross=gross)
     plain = [("storey", "cubic_stiffness"), ("storey", "air_spring")]
     assert [(one.location, one.effect) for one in chosen] == plain + [("storey", "bouc_wen")] * gross
+
+
+def test_what_would_be_significant_on_the_whole_recording_is_fitted() -> None:
+    law = find_law("cubic_stiffness")
+    scores = {"one": 19.0, "two": 26.0, "three": 12.0}
+    candidates = tuple(Candidate(Term(law, at, law.absent), s, ELEMENT) for at, s in scores.items())
+    screening = Screening(candidates, {ELEMENT: 100})
+    assert [one.location for one in shortlist(screening, alpha=1e-4)] == ["two"]
+    assert {one.location for one in shortlist(screening, alpha=1e-4, whole=1 / 0.7)} == {"one", "two"}
