@@ -45,6 +45,7 @@ from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
 from sprung.model.diagnosis.rules import Rules
+from sprung.model.diagnosis.selection.compete import noise_bound
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import out_of_range
 from sprung.model.system import System
@@ -112,7 +113,9 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
     judgement = judged(state, before, after, noisy, ended)
-    if np.any(judgement.errors.unexplained(state.options.rules.verdict) > 0):
+    # the floor may contain what the findings leave; where chi-square shows it, values include it all the same
+    more = state.fit.reduced > noise_bound(state.problem, state.fit)
+    if more or np.any(judgement.errors.unexplained(state.options.rules.verdict) > 0):
         final = replace(final, covariance=final.covariance + misfit_covariance(state.problem, state.fit))
     return Outcome(state, final, before, after, noisy, judgement)
 
