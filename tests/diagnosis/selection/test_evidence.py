@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -111,7 +113,7 @@ def test_the_whole_recording_settles_what_its_fitted_part_does_not() -> None:
         on_part = np.array([chance(float(one), 1, 1) for one in gain])
         on_whole = np.array(
             [
-                chance_on_whole([(float(g), 1)], 1, alpha, 1 / share[0], lambda r=float(r): r)
+                chance_on_whole([(float(g), 1)], 1, alpha, 1 / share[0], partial(float, r))
                 for g, r in zip(gain, rest, strict=True)
             ]
         )
