@@ -30,7 +30,8 @@ METHOD_NAMES = {
 
 
 def states(task: Task, shown: dict[str, Predicted], path: Path, window: int = 0) -> None:
-    """True, encoded and simulated states of one test window, a column per method."""
+    """True, encoded and simulated states of one test window, a column for each of the paper's methods."""
+    shown = {method: found for method, found in shown.items() if method in METHOD_NAMES}
     if not shown:
         return
     picked = range(0, len(task.states), max(1, len(task.states) // 4))
