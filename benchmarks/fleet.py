@@ -1,7 +1,7 @@
 """`sprung bench fleet PART`: the same on one process and on many, and what many cost.
 
-PART is one of identity, scaling, ingest, edge, chaos, cluster, plan, or quick (identity, edge, cluster and plan).  Ray
-and PostgreSQL are used where they are installed; a part that needs one that is not says so and ends.
+PART is one of identity, scaling, ingest, start, edge, chaos, cluster, plan, or quick (identity, edge, cluster and
+plan).  Ray and PostgreSQL are used where they are installed; a part that needs one that is not says so and ends.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from sprung.benchmarks.fleet_compare import differences
 from sprung.benchmarks.fleet_load import ingest
 from sprung.benchmarks.fleet_plan import cluster, measured_stages, plan
 from sprung.benchmarks.fleet_processes import busy_seconds
+from sprung.benchmarks.fleet_start import start
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.system import System, load_system
 from sprung.replay.writing import write_recording
@@ -37,7 +38,7 @@ from sprung.service.sources.reading import ReadRequest, ThreadReading
 
 Figures = Iterator[dict[str, Any]]
 FIRST = 1_790_000_000_000_000_000  # ns
-PARTS = ("identity", "scaling", "ingest", "edge", "chaos", "cluster", "plan", "quick")
+PARTS = ("identity", "scaling", "ingest", "start", "edge", "chaos", "cluster", "plan", "quick")
 TOLERANCE = 1e-12
 
 
@@ -65,6 +66,8 @@ def run(
         yield from scaling(recordings, seconds, workers)
     if part == "ingest":
         yield from ingest(workers, seconds, minutes, *([(together,)] if together else []))
+    if part == "start":
+        yield from start(workers)
     if part in ("edge", "quick"):
         yield from edge(min(seconds, 120.0))
     if part == "chaos":

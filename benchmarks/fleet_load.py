@@ -89,7 +89,7 @@ def ingest(workers: int, seconds: float, minutes: float, together: Sequence[int]
         single = SentLoad("/identify?track=true", body, _named(1))
         with ExitStack() as alone:
             store = {"SPRUNG_STORE": server.database()}
-            port = _served(alone, ["serve", "--port"], folder, store, "/health/live")
+            port = served(alone, ["serve", "--port"], folder, store, "/health/live")
             single.send(port, min(5.0, seconds), 0.0)  # warm
             at_rest = _busy(server)
             one = single.send(port, seconds, 0.0)
@@ -101,7 +101,7 @@ def ingest(workers: int, seconds: float, minutes: float, together: Sequence[int]
             "SPRUNG_CLIENT_REQUESTS_PER_SECOND": "1e6",
         }
         command = ["fleet", "serve", "--workers", str(workers), "--replicas", "1", "--cores", "0.5", "--port"]
-        fleet = _served(stack, command, f"{folder}/fleet", more, "/health/ready")
+        fleet = served(stack, command, f"{folder}/fleet", more, "/health/ready")
         for windows in together:
             many = SentLoad("/ingest/windows", body, _named(CLIENTS), together=windows)
             yield from _fleet_figures(fleet, server, many, one.rate, spent, seconds)
@@ -220,7 +220,7 @@ def _named(count: int) -> list[str]:
     return [f"{name}-{i}" for i in range(count)]
 
 
-def _served(stack: ExitStack, command: list[str], folder: str, more: dict[str, str], ready: str) -> int:
+def served(stack: ExitStack, command: list[str], folder: str, more: dict[str, str], ready: str) -> int:
     """Start a command in a process of its own and wait until it answers; its port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

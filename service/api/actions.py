@@ -11,7 +11,9 @@ from pydantic import Field
 
 from sprung.model.tracking.tracker import TrackerStateError
 from sprung.service.api import models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import CoreOf, known_vehicle, read
+from sprung.service.api.actors import ActorOf
+from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import LINE_PATTERN, TEXT_PATTERN, StrictBody
 from sprung.service.api.fleet import vehicle_answer
 from sprung.service.api.idempotency import IdempotentRequests, OnceOf

@@ -14,7 +14,9 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, Response
 from pydantic import Field
 
-from sprung.service.api.access import ActorOf, CoreOf, json_response, read
+from sprung.service.api.access import CoreOf, read
+from sprung.service.api.actors import ActorOf
+from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import LINE_PATTERN, StrictBody
 from sprung.service.store import audit
 from sprung.service.store.tokens import TokenRow

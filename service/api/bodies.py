@@ -12,12 +12,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import PydanticCustomError, from_json
 
 from sprung.model.signals import FloatArray
-from sprung.model.system import System
 from sprung.model.text import CONTROL, UNSEEN
 from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
 from sprung.service.api.twice import keys_twice
 from sprung.service.fleet.message import SentWindows
-from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.form import WindowForm
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
 VEHICLE_ID = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")
@@ -90,7 +89,7 @@ class WindowHead(StrictBody):
     start: str | None = Field(default=None, max_length=40)
 
 
-def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]:
+def read_window(content: bytes, form: WindowForm) -> tuple[WindowHead, FloatArray]:
     """The head of a `WindowBody` and its samples, shape (T, C), NaN for absent channels.
 
     Costs milliseconds for any body within the limit, right or wrong: the first errors are told, then it stops.
@@ -98,14 +97,14 @@ def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]
     """
     raw = _object(content)
     wrong: list[dict[str, str]] = []
-    values = _samples(raw.pop("channels", None), engine, wrong)
-    head = _head(raw, engine, wrong)
+    values = _samples(raw.pop("channels", None), form, wrong)
+    head = _head(raw, form, wrong)
     if head is None or wrong:
         raise _refused(wrong)
     return head, values
 
 
-def read_windows(content: bytes, engine: Engine, now: int) -> SentWindows:
+def read_windows(content: bytes, form: WindowForm, now: int) -> SentWindows:
     """One window, as `read_window` takes it, or several of a vehicle: `windows`, each with `start` and `channels`.
 
     Vehicle and starts are needed.  now: ns since epoch.  Raises a 422 ApiProblem that names the fields.
@@ -115,7 +114,7 @@ def read_windows(content: bytes, engine: Engine, now: int) -> SentWindows:
     if several is None:
         several = [{key: raw.pop(key) for key in ("start", "channels") if key in raw}]
     wrong: list[dict[str, str]] = []
-    head = _head(raw, engine, wrong)
+    head = _head(raw, form, wrong)
     if not isinstance(several, list) or not 0 < len(several) <= MOST_WINDOWS:
         wrong.append(_wrong("windows", f"should be a list of 1 to {MOST_WINDOWS} windows"))
         raise _refused(wrong)
@@ -126,7 +125,7 @@ def read_windows(content: bytes, engine: Engine, now: int) -> SentWindows:
             wrong.append(_wrong(f"{place}start", "is needed beside channels, and nothing else"))
             break
         starts.append(_time(one["start"], now, place))
-        values.append(_samples(one["channels"], engine, wrong, place))
+        values.append(_samples(one["channels"], form, wrong, place))
         if len(wrong) >= SHOWN_ERRORS:
             break
     if head is not None and head.vehicle is None:
@@ -168,7 +167,7 @@ def _refused(wrong: list[dict[str, str]]) -> ApiProblem:
     return ApiProblem(422, f"{wrong[0]['field']} {wrong[0]['detail']}{more}", wrong[:SHOWN_ERRORS])
 
 
-def _head(raw: dict[str, object], engine: Engine, wrong: list[dict[str, str]]) -> WindowHead | None:
+def _head(raw: dict[str, object], form: WindowForm, wrong: list[dict[str, str]]) -> WindowHead | None:
     """What stands beside the samples; adds to `wrong` where it is none, or of another rate."""
     if len(raw) > MOST_KEYS:
         wrong.append(_wrong("body", f"has {len(raw) + 1} keys; a window has four"))
@@ -178,37 +177,35 @@ def _head(raw: dict[str, object], engine: Engine, wrong: list[dict[str, str]]) -
     except ValidationError as error:
         wrong += [dict(fault) for fault in from_validation(error).errors]
         return None
-    system = engine.system
-    if abs(head.sample_rate / system.sample_rate - 1) > RATE_TOLERANCE:
-        detail = f"is {head.sample_rate:g} Hz, {system.name} needs {system.sample_rate:g} Hz"
+    if abs(head.sample_rate / form.sample_rate - 1) > RATE_TOLERANCE:
+        detail = f"is {head.sample_rate:g} Hz, {form.system} needs {form.sample_rate:g} Hz"
         wrong.append(_wrong("sample_rate", detail))
     return head
 
 
-def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]], place: str = "") -> FloatArray:
+def _samples(channels: object, form: WindowForm, wrong: list[dict[str, str]], place: str = "") -> FloatArray:
     """Samples of all channels, shape (T, C); adds to `wrong`, at most a few more than are shown."""
-    system = engine.system
-    values = np.full((system.window, len(system.channels)), np.nan)
+    values = np.full((form.length, len(form.channels)), np.nan)
     if not isinstance(channels, dict):
         wrong.append(_wrong(f"{place}channels", "should be an object of samples by channel"))
         return values
     if len(channels) > MOST_CHANNELS:
         wrong.append(_wrong(f"{place}channels", f"are {len(channels)}; more than {MOST_CHANNELS} are not looked at"))
         return values
-    names = {channel.name: i for i, channel in enumerate(system.channels)}
-    together = _numbers(channels, system.window) if names.keys() >= channels.keys() else None
+    names = {name: i for i, name in enumerate(form.channels)}
+    together = _numbers(channels, form.length) if names.keys() >= channels.keys() else None
     if together is not None:
         values[:, [names[name] for name in channels]] = together
     else:
-        wrong += _faults(channels, names, system, place)
+        wrong += _faults(channels, names, form, place)
         if len(wrong) >= SHOWN_ERRORS:
             return values
-    for some in system.needed:
+    for some in form.needed:
         if not some & channels.keys():
-            first = next(channel.name for channel in system.inputs if channel.name in some)
+            first = next(name for name in form.inputs if name in some)
             others = f", and so are {len(some) - 1} like it" if len(some) > 1 else ""
             wrong.append(_wrong(f"{place}channels.{first}", f"is missing{others}; nothing can be identified without"))
-    if not any(sensor in channels for sensor in system.sensors):
+    if not any(sensor in channels for sensor in form.sensors):
         wrong.append(_wrong(f"{place}channels", "hold no sensor; without any nothing can be identified"))
     return values
 
@@ -228,16 +225,18 @@ def _numbers(channels: dict[str, object], length: int) -> FloatArray | None:
     return columns.T if columns.min() >= -LARGEST and columns.max() <= LARGEST else None
 
 
-def _faults(channels: dict[str, object], names: Mapping[str, int], system: System, place: str) -> list[dict[str, str]]:
+def _faults(
+    channels: dict[str, object], names: Mapping[str, int], form: WindowForm, place: str
+) -> list[dict[str, str]]:
     """What is wrong with samples by channel, of which something is; at most a few more than are shown."""
     wrong: list[dict[str, str]] = []
     for name, samples in channels.items():
         if len(wrong) >= SHOWN_ERRORS:
             break
         if name not in names:
-            wrong.append(_wrong(f"{place}channels.{name[:160]}", f"is no channel of {system.name}"))
-        elif _numbers({name: samples}, system.window) is None:
-            at, fault = _not_numbers(samples, system.window)
+            wrong.append(_wrong(f"{place}channels.{name[:160]}", f"is no channel of {form.system}"))
+        elif _numbers({name: samples}, form.length) is None:
+            at, fault = _not_numbers(samples, form.length)
             wrong.append(_wrong(f"{place}channels.{name}{at}", fault))
     return wrong
 

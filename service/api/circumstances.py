@@ -6,7 +6,8 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
-from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import CoreOf, known_vehicle, read
+from sprung.service.api.answers import json_response
 from sprung.service.api.circumstance_models import CircumstancesAnswer
 from sprung.service.api.queries import FOREVER, Id, Since, Until, time_of
 from sprung.service.monitoring.views import UNITS

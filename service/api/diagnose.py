@@ -12,7 +12,9 @@ from sqlalchemy import Connection
 
 from sprung.service.access.tokens import Actor
 from sprung.service.api import job_models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, note, own_vehicle, read
+from sprung.service.api.access import CoreOf, known_vehicle, note, read
+from sprung.service.api.actors import ActorOf, own_vehicle
+from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import DiagnoseBody
 from sprung.service.api.idempotency import IdempotentRequests, OnceOf
 from sprung.service.api.problems import ApiProblem, from_validation

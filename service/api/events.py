@@ -10,7 +10,8 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
 
-from sprung.service.api.access import ClientOf, CoreOf
+from sprung.service.api.access import CoreOf
+from sprung.service.api.actors import ClientOf
 from sprung.service.core import Core
 from sprung.service.monitoring.hub import Listener
 from sprung.service.times import optional_iso

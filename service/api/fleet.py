@@ -9,7 +9,9 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.service.api import models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import CoreOf, known_vehicle, read
+from sprung.service.api.actors import ActorOf
+from sprung.service.api.answers import json_response
 from sprung.service.api.queries import After, Id, Limit, with_cursor
 from sprung.service.core import Core
 from sprung.service.monitoring.engines import ServedModel

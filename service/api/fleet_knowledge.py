@@ -9,7 +9,9 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
 from sprung.service.api import models
-from sprung.service.api.access import ActorOf, CoreOf, json_response
+from sprung.service.api.access import CoreOf
+from sprung.service.api.actors import ActorOf
+from sprung.service.api.answers import json_response
 from sprung.service.fleet.statistics import DAYS, knowledge_dict
 
 router = APIRouter(tags=["vehicles"])

@@ -10,7 +10,8 @@ from fastapi.responses import Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
 from sprung.service.api import models
-from sprung.service.api.access import CoreOf, json_response
+from sprung.service.api.access import CoreOf
+from sprung.service.api.answers import json_response
 from sprung.service.api.problems import ApiProblem
 
 router = APIRouter(tags=["health"])

@@ -13,7 +13,8 @@ from sqlalchemy import Connection
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 from sprung.service.api import models
-from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import CoreOf, known_vehicle, read
+from sprung.service.api.answers import json_response
 from sprung.service.api.fleet import load_view
 from sprung.service.api.queries import FOREVER, Id, Since, Until, resolution_of, time_of, wrong_query
 from sprung.service.core import Core

@@ -19,7 +19,9 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sqlalchemy import Row, delete, select
 
-from sprung.service.api.access import ActorOf, CoreOf, json_response
+from sprung.service.api.access import CoreOf
+from sprung.service.api.actors import ActorOf
+from sprung.service.api.answers import json_response
 from sprung.service.api.problems import ApiProblem
 from sprung.service.api.scopes import FORM, content_kind
 from sprung.service.api.uploads import identity_of

@@ -12,7 +12,9 @@ from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import Estimate, FloatArray
 from sprung.service.access.tokens import Actor
 from sprung.service.api import models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
+from sprung.service.api.access import CoreOf
+from sprung.service.api.actors import ActorOf, own_vehicle
+from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import WindowBody, read_window, start_of
 from sprung.service.api.problems import ApiProblem
 from sprung.service.core import Core
@@ -60,7 +62,7 @@ async def identify(
 
 def _read(core: Core, content: bytes, actor: Actor, states: bool, track: bool) -> AskedWindow:
     """What was sent, and what the vehicle's windows are identified with; runs in a thread."""
-    head, values = read_window(content, core.engine)
+    head, values = read_window(content, core.engine.form)
     if track:
         _needed(head.vehicle)
     if head.vehicle is not None:  # named without being tracked, it is identified with its own model all the same

@@ -8,11 +8,12 @@ from fastapi.responses import Response
 from pydantic import TypeAdapter, ValidationError
 
 from sprung.service.api import models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
+from sprung.service.api.access import CoreOf
+from sprung.service.api.actors import ActorOf, own_vehicle
+from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import VehicleId
 from sprung.service.api.problems import ApiProblem
-from sprung.service.fleet.ingest import OtherModel, read_messages
-from sprung.service.fleet.message import MEDIA_TYPE
+from sprung.service.fleet.message import MEDIA_TYPE, OtherModel, read_messages
 
 router = APIRouter(tags=["identify"])
 BODY = {

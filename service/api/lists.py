@@ -10,7 +10,8 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.service.api import job_models, models
-from sprung.service.api.access import CoreOf, json_response, read
+from sprung.service.api.access import CoreOf, read
+from sprung.service.api.answers import json_response
 from sprung.service.api.queries import After, Limit, Since, time_of, with_cursor
 from sprung.service.api.recordings import job_dict
 from sprung.service.core import Core

@@ -1,11 +1,14 @@
 """HTTP ingest of the fleet variant: receives estimates and windows and passes them to identification and folding.
 
 It is the same guard, the same bodies and the same answers as in the single process; behind it is anything that
-implements `Behind`, such as Ray Serve (`service.api.ray_serving`).
+implements `Behind`, such as Ray Serve (`service.api.ray_serving`).  It loads no model: what windows have to look like
+it asks those who identify them.
 """
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Protocol
 
 from fastapi import FastAPI, Request
@@ -17,15 +20,15 @@ from sqlalchemy.exc import SQLAlchemyError
 from sprung import __version__
 from sprung.service.access.tokens import Tokens
 from sprung.service.api import models, problems
-from sprung.service.api.access import ActorOf, json_response, own_vehicle
+from sprung.service.api.actors import ActorOf, own_vehicle
+from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import VehicleId, read_windows
 from sprung.service.api.guard import Guard
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.problems import ApiProblem
 from sprung.service.errors import Busy
-from sprung.service.fleet.ingest import OtherModel, read_messages
-from sprung.service.fleet.message import IngestResult, SentWindows
-from sprung.service.monitoring.engine import Engine
+from sprung.service.fleet.message import IngestResult, OtherModel, SentWindows, read_messages
+from sprung.service.monitoring.form import WindowForm
 from sprung.service.settings import Settings
 from sprung.service.store import Store
 from sprung.service.times import now_ns
@@ -36,6 +39,9 @@ _ID: TypeAdapter[str] = TypeAdapter(VehicleId)
 class Behind(Protocol):
     """Who does the work.  Raises Busy when too much waits."""
 
+    async def form(self) -> WindowForm:
+        """What windows look like that are identified; asked once, before the first request."""
+
     async def fold(self, body: bytes) -> IngestResult:
         """Fold a message of estimates; it is stored when this returns."""
 
@@ -43,9 +49,15 @@ class Behind(Protocol):
         """Identify windows and fold their estimates."""
 
 
-def ingest_app(settings: Settings, engine: Engine, store: Store, behind: Behind) -> FastAPI:
+def ingest_app(settings: Settings, store: Store, behind: Behind) -> FastAPI:
     """`POST /ingest/estimates`, `POST /ingest/windows` and the health of a replica."""
-    app = FastAPI(title="Sprung ingest", version=__version__, docs_url=None, redoc_url=None)
+
+    @asynccontextmanager
+    async def asked(app: FastAPI) -> AsyncIterator[None]:
+        app.state.form = await behind.form()
+        yield
+
+    app = FastAPI(title="Sprung ingest", version=__version__, docs_url=None, redoc_url=None, lifespan=asked)
     problems.install(app)
 
     @app.post("/ingest/estimates", response_model=models.IngestAnswer)
@@ -65,7 +77,7 @@ def ingest_app(settings: Settings, engine: Engine, store: Store, behind: Behind)
     @app.post("/ingest/windows", response_model=models.IngestAnswer)
     async def windows(request: Request, actor: ActorOf) -> Response:
         """Windows of a vehicle: one as `POST /identify` takes it, with vehicle and start, or a list `windows`."""
-        sent = await run_in_threadpool(read_windows, await request.body(), engine, now_ns())
+        sent = await run_in_threadpool(read_windows, await request.body(), app.state.form, now_ns())
         own_vehicle(actor, sent.vehicle)
         try:
             return _answer(await behind.identify_and_fold(sent))

@@ -56,17 +56,9 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
         """The door's ASGI application; runs in its replica, and what it needs is imported there alone."""
         from sprung.service.api.live_ingest import ingest_app
         from sprung.service.fleet.ray_behind import RayBehind
-        from sprung.service.monitoring.engine import load_engine
 
-        engine = load_engine(settings)
-        behind = RayBehind(
-            serve.get_deployment_handle("identify", APPLICATION),
-            serve.get_deployment_handle("fold", APPLICATION),
-            engine.digest,
-            sizes,
-            serve.batch,
-        )
-        return ingest_app(settings, engine, open_store(settings.store_url), behind)
+        identify, fold = (serve.get_deployment_handle(name, APPLICATION) for name in ("identify", "fold"))
+        return ingest_app(settings, open_store(settings.store_url), RayBehind(identify, fold, sizes, serve.batch))
 
     class Door:
         """Authenticates requests, reads their bodies, passes them on."""

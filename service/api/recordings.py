@@ -10,7 +10,9 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.service.api import job_models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, note, own_vehicle, read
+from sprung.service.api.access import CoreOf, note, read
+from sprung.service.api.actors import ActorOf, own_vehicle
+from sprung.service.api.answers import json_response
 from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.uploads import BODY, receive
 from sprung.service.errors import NotFound

@@ -14,7 +14,8 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.service.api import models
-from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import CoreOf, known_vehicle, read
+from sprung.service.api.answers import json_response
 from sprung.service.api.head import headers_only
 from sprung.service.api.queries import FOREVER, Id
 from sprung.service.core import Core

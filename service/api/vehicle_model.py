@@ -12,7 +12,9 @@ from sqlalchemy import Connection
 
 from sprung.service.access.tokens import Actor
 from sprung.service.api import models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import CoreOf, known_vehicle, read
+from sprung.service.api.actors import ActorOf
+from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import StrictBody
 from sprung.service.api.fleet import load_view
 from sprung.service.api.idempotency import OnceOf

@@ -28,10 +28,10 @@ from sprung.service.monitoring.views import (
     alarm_dict,
     changed_part,
     load_parameters,
-    size_in_words,
     vehicle_view,
     window_dict,
 )
+from sprung.service.monitoring.words import size_in_words
 from sprung.service.settings import Settings, settings_with
 from sprung.service.sources.feed import FeedResult, comfort_dict, feed_file
 from sprung.service.store import open_store, work

@@ -14,7 +14,8 @@ from sprung.service.export.tables import estimate, values_of
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.ring import Excerpt
 from sprung.service.monitoring.simulated import Compared
-from sprung.service.monitoring.views import changed_part, size_in_words
+from sprung.service.monitoring.views import changed_part
+from sprung.service.monitoring.words import size_in_words
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.history import Series
 from sprung.service.store.marks import MarkRow

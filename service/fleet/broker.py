@@ -16,8 +16,8 @@ from typing import Literal, Protocol
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import Busy, UserError
-from sprung.service.fleet.ingest import Ingest, read_messages
-from sprung.service.fleet.message import Message
+from sprung.service.fleet.ingest import Ingest
+from sprung.service.fleet.message import Message, read_messages
 
 log = logging.getLogger("sprung.broker")
 TOGETHER = 64  # messages of one transaction

@@ -17,7 +17,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import UserError
-from sprung.service.fleet.message import IngestResult, Message, UnreadableMessage, WindowEstimate, decode, encode
+from sprung.service.fleet.message import IngestResult, Message, OtherModel, WindowEstimate, decode, encode
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import FoldedWindows, HeldVehicle, WindowsToFold
@@ -31,10 +31,6 @@ log = logging.getLogger("sprung.ingest")
 SWEEP_SECONDS = 1.0
 FIRST_TIME = 946_684_800 * NANOSECONDS  # 2000: before it no clock of a vehicle was right
 CONTIGUOUS = 1.01  # hops: a window that begins so long after the last one follows it
-
-
-class OtherModel(UserError):
-    """Estimates of another system file or estimator than this service has."""
 
 
 class Ingest:
@@ -245,14 +241,6 @@ def due_windows(received: dict[int, int], last: int, hop: float, late: int, now:
         due.append(start)
         last = max(last, start)
     return due
-
-
-def read_messages(bodies: Sequence[bytes]) -> list[Message]:
-    """Decoded messages.  Raises UserError for invalid ones."""
-    try:
-        return [decode(body) for body in bodies]
-    except UnreadableMessage as error:
-        raise UserError(str(error)) from None
 
 
 def _restored(row: Waiting) -> WindowEstimate:

@@ -21,6 +21,7 @@ import msgpack
 import numpy as np
 
 from sprung.model.signals import Deviating, Estimate, FloatArray, MeasurementFault, Outcome, Window
+from sprung.service.errors import UserError
 from sprung.service.fleet.coding import (
     from_log_steps,
     log_steps,
@@ -44,6 +45,10 @@ Coding = Literal["exact", "small"]
 
 class UnreadableMessage(ValueError):
     """Not a message of this format; one line."""
+
+
+class OtherModel(UserError):
+    """Estimates of another system file or estimator than this service has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +150,14 @@ def decode(data: bytes) -> Message:
         raise
     except (zlib.error, msgpack.UnpackException, ValueError, TypeError, KeyError, IndexError, OverflowError) as error:
         raise UnreadableMessage(f"not a message of estimates ({type(error).__name__}: {error})"[:300]) from error
+
+
+def read_messages(bodies: Sequence[bytes]) -> list[Message]:
+    """Decoded messages.  Raises UserError for invalid ones."""
+    try:
+        return [decode(body) for body in bodies]
+    except UnreadableMessage as error:
+        raise UserError(str(error)) from None
 
 
 def _read(body: dict[str, Any]) -> Message:

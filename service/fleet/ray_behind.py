@@ -1,4 +1,4 @@
-"""What the door of Ray Serve passes requests on to.  Imported by the door's replica alone, as it takes seconds."""
+"""What the door of Ray Serve passes requests on to.  Imported by the door's replica alone."""
 
 from __future__ import annotations
 
@@ -11,25 +11,31 @@ import numpy as np
 
 from sprung.model.signals import Estimate, FloatArray
 from sprung.service.errors import Busy, UserError
-from sprung.service.fleet.ingest import read_messages
-from sprung.service.fleet.message import IngestResult, Message, SentWindows, WindowEstimate
+from sprung.service.fleet.message import IngestResult, Message, SentWindows, WindowEstimate, read_messages
 from sprung.service.fleet.serving_sizes import ServingSizes
+from sprung.service.monitoring.form import WindowForm
 
 
 class RayBehind:
     """What the door sees of the two.  Requests are put together here: a call costs more than a window's identification,
     so that one carries the windows, or the messages, of all that ask at a time."""
 
-    def __init__(self, identify: Any, fold: Any, digest: str, sizes: ServingSizes, batch: Callable[..., Any]) -> None:
+    def __init__(self, identify: Any, fold: Any, sizes: ServingSizes, batch: Callable[..., Any]) -> None:
         """identify, fold: handles of the deployments; batch: `serve.batch`, which runs in a replica only."""
         self._identify = identify
         self._fold = fold
-        self._digest = digest
+        self._form: WindowForm | None = None
         self._waiting, self._most = 0, sizes.queued * sizes.replicas
         # one more than there are replicas, so that none waits for the next; more, and batches stay small
         wait = {"batch_wait_timeout_s": sizes.batch_wait_seconds, "max_concurrent_batches": sizes.replicas + 1}
         self._identified = batch(max_batch_size=sizes.batch_windows, **wait)(self._identify_together)
         self._folded = batch(max_batch_size=sizes.batch_messages, **wait)(self._fold_together)
+
+    async def form(self) -> WindowForm:
+        """What windows look like, from a replica that identifies; waits for the first of them."""
+        if self._form is None:
+            self._form = await _asked(self._identify.form.remote())
+        return self._form
 
     async def fold(self, body: bytes) -> IngestResult:
         """Fold a message."""
@@ -43,7 +49,7 @@ class RayBehind:
             estimates: list[Estimate] = await asyncio.gather(*ways)
             found = zip(sent.starts, estimates, strict=True)
             windows = tuple(WindowEstimate(start, "used", None, 0, False, estimate) for start, estimate in found)
-            return await self._fold_one(Message(sent.vehicle, self._digest, windows))
+            return await self._fold_one(Message(sent.vehicle, (await self.form()).digest, windows))
 
     @contextmanager
     def _place(self) -> Iterator[None]:

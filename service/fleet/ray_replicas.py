@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from sprung.model.signals import Estimate, FloatArray
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import IngestResult, Message
+from sprung.service.monitoring.form import WindowForm
 from sprung.service.processes.threads import one_thread_each
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
@@ -25,6 +26,10 @@ class IdentifyReplica:
         from sprung.service.monitoring.engine import load_engine
 
         self._engine = load_engine(settings)
+
+    async def form(self) -> WindowForm:
+        """What windows have to look like."""
+        return self._engine.form
 
     async def identify(self, starts: list[int], values: FloatArray) -> list[Estimate]:
         """The estimates of windows, values (B, T, C)."""

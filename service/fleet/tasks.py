@@ -69,14 +69,12 @@ class RayTasks:
             raise UserError("Ray is not installed: pip install 'sprung[fleet]'") from error
         self._ray: Any = ray
         self._started = not ray.is_initialized()
-        address = os.environ.get("RAY_ADDRESS")
-        try:
-            if self._started and address:
-                ray.init(address=address, log_to_driver=False)
-            elif self._started:
+        if self._started:
+            address = os.environ.get("RAY_ADDRESS")
+            if address:
+                _join_ray(address)
+            else:
                 start_ray(workers or os.cpu_count())
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            raise UserError(f"Ray: {str(error).splitlines()[0]}") from error
         self.name = f"Ray, {self._ray.cluster_resources().get('CPU', 0):.0f} cores"
         self._remote: dict[Callable[..., Any], Any] = {}
 
@@ -107,20 +105,32 @@ class RayTasks:
 def start_ray(cores: int | None, config: dict[str, Any] | None = None) -> None:
     """A Ray of this process on this machine, that says nothing of itself.
 
-    cores: default all; config: Ray's own settings, by their names in its source.
+    cores: default all; config: Ray's own settings, by their names in its source.  Raises UserError.
     """
     import ray
 
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use to its makers otherwise
     logging.getLogger("ray").setLevel(logging.ERROR)
-    ray.init(
-        num_cpus=cores,
-        object_store_memory=OBJECT_STORE_BYTES,
-        include_dashboard=False,
-        log_to_driver=False,
-        configure_logging=False,
-        _system_config=config,
-    )
+    try:
+        ray.init(
+            num_cpus=cores,
+            object_store_memory=OBJECT_STORE_BYTES,
+            include_dashboard=False,
+            log_to_driver=False,
+            configure_logging=False,
+            _system_config=config,
+        )
+    except Exception as error:  # a plain one where its processes are not there within 30 s
+        raise UserError(f"Ray did not start: {str(error).splitlines()[0]}") from error
+
+
+def _join_ray(address: str) -> None:
+    import ray
+
+    try:
+        ray.init(address=address, log_to_driver=False)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise UserError(f"Ray at {address}: {str(error).splitlines()[0]}") from error
 
 
 def ray_installed() -> bool:

@@ -20,6 +20,7 @@ from sprung.model.tracking.alarms import LoadLimit
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
 from sprung.service.can_database import database_of
 from sprung.service.errors import UserError
+from sprung.service.monitoring.form import WindowForm
 from sprung.service.monitoring.signed import check_signature
 from sprung.service.settings import Settings
 
@@ -52,6 +53,22 @@ class Engine:
     def digest(self) -> str:
         """The key of the model under which estimates are stored."""
         return self.identifier.digest
+
+    @property
+    def form(self) -> WindowForm:
+        """What its windows look like."""
+        system = self.system
+        channels, inputs = (tuple(channel.name for channel in some) for some in (system.channels, system.inputs))
+        return WindowForm(
+            self.digest,
+            system.name,
+            system.sample_rate,
+            system.window,
+            channels,
+            inputs,
+            tuple(system.sensors),
+            system.needed,
+        )
 
     def description(self) -> dict[str, Any]:
         """What the store must know to read its arrays without this code."""

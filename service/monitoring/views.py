@@ -17,6 +17,7 @@ from sprung.model.system import System
 from sprung.model.tracking.fusion import KNOWN
 from sprung.model.tracking.tracker import Alarm, TrackerState
 from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.words import spoken
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.standing import UNINFORMATIVE
 from sprung.service.store.status import Status
@@ -205,30 +206,9 @@ def _of_sensors(engine: Engine, last: WindowRecord | None) -> dict[str, float]:
     return {} if last is None or last.solved is None else sensor_dict(engine, last.solved.per_sensor)
 
 
-def spoken(parameter: str) -> str:
-    """A parameter as a sentence has it: of `*.damping` and `primary_*.damping` what they mean."""
-    element, _, quantity = parameter.rpartition(".")
-    if "*" not in element:
-        return parameter
-    group = element.replace("*", "").strip("_").replace("_", " ")
-    return f"{quantity} of all {f'{group} ' if group else ''}elements"
-
-
 def changed_part(alarm: Alarm | AlarmRow) -> str:
     """What an alarm is about; what the measurements do not tell it from comes first, for a sensor is checked sooner."""
     return " or ".join([*alarm.alternatives, spoken(alarm.parameter or "")])
-
-
-def size_in_words(parameter: str | None, change: float | None, std: float | None = None) -> str:
-    """How large an alarm's change is, with its deviation where that is given; empty where it is not known.
-
-    Changes are relative, `-29.6 ± 1.5 %`; those of a delay are in s, `+4.0 ± 0.1 ms`.
-    """
-    if change is None:
-        return ""
-    factor, unit = (1e3, "ms") if (parameter or "").endswith(".delay") else (100.0, "%")
-    deviation = "" if std is None else f" ± {factor * std:.1f}"
-    return f"{factor * change:+.1f}{deviation} {unit}"
 
 
 def unclear(rivals: Sequence[str]) -> str:

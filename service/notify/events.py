@@ -6,7 +6,8 @@ import uuid
 from typing import Any
 from urllib.parse import quote
 
-from sprung.service.monitoring.views import finite, size_in_words, spoken, unclear
+from sprung.service.monitoring.views import finite, unclear
+from sprung.service.monitoring.words import size_in_words, spoken
 from sprung.service.store.fleet import AlarmChange
 from sprung.service.times import optional_iso, to_iso
 

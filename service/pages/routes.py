@@ -12,7 +12,8 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse
 from sqlalchemy import Connection
 
-from sprung.service.api.access import ActorOf, CoreOf, read
+from sprung.service.api.access import CoreOf, read
+from sprung.service.api.actors import ActorOf
 from sprung.service.api.fleet import silent_before
 from sprung.service.api.queries import one_of
 from sprung.service.fleet.statistics import knowledge_dict

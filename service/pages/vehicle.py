@@ -11,8 +11,9 @@ from fastapi.responses import HTMLResponse, Response
 from sqlalchemy import Connection
 
 from sprung.model.system import System
-from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import CoreOf, known_vehicle, read
 from sprung.service.api.actions import mark_dict
+from sprung.service.api.answers import json_response
 from sprung.service.api.fleet import load_view, silent_before
 from sprung.service.api.history import MAX_POINTS, served_by
 from sprung.service.api.lists import report_dict

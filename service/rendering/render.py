@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from sprung.service.monitoring.views import size_in_words, spoken
+from sprung.service.monitoring.words import size_in_words, spoken
 from sprung.service.times import to_iso
 
 signed_in: ContextVar[str] = ContextVar("signed_in", default="")  # whose session the request is of

@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sprung.model.identification.estimates import WITHOUT_VALUES
-from sprung.service.monitoring.views import VehicleView, changed_part, size_in_words, suspected, unclear
+from sprung.service.monitoring.views import VehicleView, changed_part, suspected, unclear
+from sprung.service.monitoring.words import size_in_words
 from sprung.service.rendering.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason

@@ -161,7 +161,7 @@ def test_the_fleets_door_refuses_whoever_has_no_business_there(core: Core, syste
         tokens.revoke(connection, gone.id, 1)
     (north, _), (read, _) = make("n", ["ingest"], fleet="north-"), make("r", ["read"])
     south, _ = make("s", ["ingest"], fleet="south-")
-    app = ingest_app(core.settings, core.engine, core.store, AtOnce(core.pipeline))
+    app = ingest_app(core.settings, core.store, AtOnce(core.pipeline))
     dropped = WindowEstimate(NOW, "dropped", "clipped", 0, False, None)
     message = encode(Message("south-1", core.engine.digest, (dropped,)), "small")
     bodies: dict[tuple[str, str], dict[str, Any]] = {

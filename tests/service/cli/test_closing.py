@@ -1,7 +1,7 @@
 """What a replay says last of measurements and loads."""
 
 from sprung.service.cli.replay import measurement_lines
-from sprung.service.monitoring.views import size_in_words
+from sprung.service.monitoring.words import size_in_words
 
 
 def test_the_size_of_a_change_is_said_in_its_own_unit() -> None:

@@ -19,9 +19,9 @@ from sprung.model.system import System
 from sprung.service.errors import UserError
 from sprung.service.fleet import broker as module
 from sprung.service.fleet.broker import Broker, BrokerMessage, ConsumerCounts, consume
-from sprung.service.fleet.ingest import Ingest, read_messages
+from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.kafka_broker import KafkaBroker
-from sprung.service.fleet.message import encode
+from sprung.service.fleet.message import encode, read_messages
 from sprung.service.fleet.nats_broker import NatsBroker, NatsLink, ack_seconds
 from sprung.service.fleet.spool import SpoolEntry
 from sprung.service.monitoring.engine import Engine

@@ -13,9 +13,18 @@ from fastapi.testclient import TestClient
 from sprung.model.system import System
 from sprung.service.api.live_ingest import ingest_app
 from sprung.service.errors import Busy
-from sprung.service.fleet.ingest import Ingest, read_messages
-from sprung.service.fleet.message import MEDIA_TYPE, IngestResult, Message, SentWindows, WindowEstimate, encode
+from sprung.service.fleet.ingest import Ingest
+from sprung.service.fleet.message import (
+    MEDIA_TYPE,
+    IngestResult,
+    Message,
+    SentWindows,
+    WindowEstimate,
+    encode,
+    read_messages,
+)
 from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.form import WindowForm
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
 from sprung.service.store import Store
@@ -29,6 +38,9 @@ class AtOnce:
         self.engine = pipeline.engine
         self.ingest = Ingest(pipeline, 0.0)
         self.busy = False
+
+    async def form(self) -> WindowForm:
+        return self.engine.form
 
     async def fold(self, body: bytes) -> IngestResult:
         if self.busy:
@@ -48,7 +60,7 @@ def behind(pipeline: Pipeline) -> AtOnce:
 
 @pytest.fixture
 def client(engine: Engine, store: Store, behind: AtOnce, tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(ingest_app(Settings(data_dir=tmp_path), engine, store, behind)) as running:
+    with TestClient(ingest_app(Settings(data_dir=tmp_path), store, behind)) as running:
         yield running
 
 

@@ -12,9 +12,23 @@ from sprung.service.errors import Busy, UserError
 from sprung.service.fleet.message import IngestResult, Message, SentWindows
 from sprung.service.fleet.ray_behind import RayBehind
 from sprung.service.fleet.serving_sizes import ServingSizes
+from sprung.service.monitoring.form import WindowForm
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, when it is imported
+
+
+FORM = WindowForm("digest", "strut", 100.0, 2, ("a", "b", "c"), ("a",), ("b", "c"), (frozenset("a"),))
+
+
+class AskedForm:
+    """The method of an identifying replica that says what windows look like."""
+
+    asked = 0
+
+    async def remote(self) -> WindowForm:
+        self.asked += 1
+        return FORM
 
 
 class Remote:
@@ -22,6 +36,7 @@ class Remote:
 
     def __init__(self, name: str, answer: Any) -> None:
         self.sizes: list[int] = []
+        self.form = AskedForm()
         self._answer = answer
         setattr(self, name, self)
 
@@ -70,7 +85,7 @@ def taken(message: Message) -> IngestResult | UserError:
 
 def behind(**sizes: Any) -> tuple[RayBehind, Remote, Remote]:
     identify, fold = Remote("identify", lambda start: None), Remote("fold", taken)
-    return RayBehind(identify, fold, "digest", ServingSizes(**sizes), batch), identify, fold
+    return RayBehind(identify, fold, ServingSizes(**sizes), batch), identify, fold
 
 
 def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
@@ -85,6 +100,16 @@ def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
     found = asyncio.run(asked())
     assert [one.vehicle for i, one in enumerate(found) if i != 3] == [f"v-{i}" for i in range(8) if i != 3]
     assert isinstance(found[3], UserError)
+
+
+def test_what_windows_look_like_is_asked_once() -> None:
+    async def asked() -> None:
+        ray, identify, fold = behind(replicas=1)
+        assert await ray.form() == FORM
+        await ray.identify_and_fold(window("v-1", 0))
+        assert (identify.form.asked, fold.form.asked) == (1, 0)
+
+    asyncio.run(asked())
 
 
 def test_too_many_at_once_are_told_so_and_places_come_free() -> None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 import signal
 import time
+from importlib import import_module
 from typing import Any
 
 import pytest
 
 from sprung.benchmarks.fleet_processes import descendants
+from tests.ray_apart import in_own_process
 
-ray: Any = pytest.importorskip("ray")
+pytest.importorskip("ray")
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
 
 
@@ -26,7 +28,9 @@ class Counter:
         return self._count
 
 
-def test_a_head_that_was_killed_goes_on_with_what_it_knew() -> None:
+def kill_and_start_anew() -> None:
+    ray: Any = import_module("ray")  # its types know no actors of plain classes
+
     from sprung.service.fleet.ray_head import RayHead
 
     head = RayHead(1)
@@ -45,3 +49,7 @@ def test_a_head_that_was_killed_goes_on_with_what_it_knew() -> None:
     finally:
         ray.shutdown()
         head.close()
+
+
+def test_a_head_that_was_killed_goes_on_with_what_it_knew() -> None:
+    in_own_process(kill_and_start_anew)

@@ -11,20 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sprung.model.system import System
+from sprung.model.system import load_system
 from sprung.service.api import ray_serving
 from sprung.service.api.ray_serving import APPLICATION
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import Settings
+from tests.ray_apart import in_own_process
 
-serve: Any = pytest.importorskip("ray.serve")
+pytest.importorskip("ray.serve")
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
 SIZES = ServingSizes(replicas=2, cores=0.5, more_after_seconds=1.0, fewer_after_seconds=3.0)
 
 
 def running() -> int:
     """Replicas that identify."""
-    found = serve.status().applications[APPLICATION].deployments["identify"].replica_states
+    from ray import serve
+
+    found: dict[Any, int] = serve.status().applications[APPLICATION].deployments["identify"].replica_states
     return int(found.get("RUNNING", 0))
 
 
@@ -37,13 +40,20 @@ def becomes(fulfilled: Callable[[], bool], seconds: float) -> bool:
     return True
 
 
-def test_replicas_come_with_the_load_and_go_with_it(system: System, tmp_path: Path) -> None:
+def test_replicas_come_with_the_load_and_go_with_it(tmp_path: Path) -> None:
+    in_own_process(come_and_go, tmp_path)
+
+
+def come_and_go(folder: Path) -> None:
+    from ray import serve
+
+    system = load_system()
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
-    settings = Settings(data_dir=tmp_path, store=f"sqlite:///{tmp_path}/sprung.db")
+    settings = Settings(data_dir=folder, store=f"sqlite:///{folder}/sprung.db")
     head = ray_serving.start(settings, SIZES, "127.0.0.1", port, None, 2)
-    handle = serve.get_deployment_handle("identify", APPLICATION)
+    handle: Any = serve.get_deployment_handle("identify", APPLICATION)
     try:
         identify = handle.identify
         assert running() == 1

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from sprung.service.errors import UserError
 from sprung.service.fleet.tasks import HereTasks, RayTasks, Tasks
 from sprung.service.times import from_iso, to_iso
+from tests.ray_apart import in_own_process
 
 
 def _check(tasks: Tasks) -> None:
@@ -24,8 +26,26 @@ def test_work_is_done_here() -> None:
 @pytest.mark.slow
 def test_work_is_done_by_ray() -> None:
     pytest.importorskip("ray")
+    in_own_process(_check_ray)
+
+
+def _check_ray() -> None:
     tasks = RayTasks(2)
     try:
         _check(tasks)
     finally:
         tasks.close()
+
+
+@pytest.mark.slow
+def test_a_ray_that_does_not_start_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray")
+
+    def init(**_given: object) -> None:
+        raise Exception("The current node timed out during startup.\nThis could happen")
+
+    monkeypatch.setattr(ray, "init", init)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    with pytest.raises(UserError) as caught:
+        RayTasks(1)
+    assert str(caught.value) == "Ray did not start: The current node timed out during startup."

@@ -27,7 +27,8 @@ from sprung.service.core import Core, build_core
 from sprung.service.errors import UserError
 from sprung.service.main import Feeds, add_live_feeds
 from sprung.service.monitoring.engine import Engine
-from sprung.service.monitoring.views import changed_part, spoken
+from sprung.service.monitoring.views import changed_part
+from sprung.service.monitoring.words import spoken
 from sprung.service.notify.events import alarm_event, sentence
 from sprung.service.notify.notices import AT_ONCE, PAUSES, Notices
 from sprung.service.notify.senders import signature
