@@ -78,6 +78,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "emps": ("sprung.benchmarks.emps", "missing physics in the EMPS record (--data DIR)"),
     "paper": ("sprung.benchmarks.paper", "the paper's systems, baselines and ablations"),
     "paper-cells": ("sprung.benchmarks.rerun_paper", "random figures of docs/paper.md, made again"),
+    "paper-compare": ("sprung.benchmarks.paper_report.compare", "two of its methods: ratios, intervals, p"),
     "paper-report": ("sprung.benchmarks.paper_report", "rows of the paper's benchmark into docs/paper.md"),
     "physics-overhead": ("sprung.benchmarks.physics_overhead", "what physics in the loop costs a training update"),
 }

@@ -18,6 +18,7 @@ from scipy import stats
 from sprung.benchmarks.paper_report.tables import ORDER, head, line
 
 FIGURES = ("SE", "PE")  # gauge-free SE and PE of each trajectory
+AS_PRINTED = (("autoencoder_plain", "autoencoder"), ("cdm_plain", "cdm"))  # over the same with the help that ALPS gets
 DRAWS = 2000  # of the bootstrap
 
 TrajectoryErrors = dict[str, np.ndarray]  # figure: (R,)
@@ -27,6 +28,7 @@ TrajectoryErrors = dict[str, np.ndarray]  # figure: (R,)
 class MethodComparison:
     """Errors of one method over those of another."""
 
+    seeds: tuple[int, ...]  # that both have
     ratio: float  # of the means over seeds and trajectories
     low: float  # 95 % bootstrap interval over seeds and, within each, trajectories
     high: float
@@ -36,14 +38,15 @@ class MethodComparison:
 
 
 def comparisons(task: str, errors: Path, best: str = "alps") -> str:
-    """Markdown table: each method against `best`, with p of Wilcoxon's test after Holm's correction over the table."""
+    """Markdown table: each method against `best`, with p of both tests after Holm's correction over the table."""
     compared = _compared_methods(task, errors, best)
-    lines = head("method", "seeds", f"SE over {best}", "p", f"PE over {best}", "p")
-    adjusted = {key: _adjusted({m: c[key].p for m, c in compared.items() if key in c}) for key in FIGURES}
+    columns = [column for key in FIGURES for column in (f"{key} over {best}", "p, trajectories", "p, seeds")]
+    lines = head("method", "seeds", *columns)
+    corrected = {key: _corrected({m: c[key] for m, c in compared.items() if key in c}) for key in FIGURES}
     for method, found in compared.items():
         cells = []
         for key in FIGURES:
-            cells += [_ratio(found[key]), f"{adjusted[key][method]:.2g}"] if key in found else ["-", "-"]
+            cells += [_ratio(found[key]), *corrected[key][method]] if key in found else ["-", "-", "-"]
         lines.append(line(method, str(len(found["SE"].by_seed)), *cells))
     return "\n".join(lines)
 
@@ -52,17 +55,28 @@ def comparisons_by_seed(task: str, errors: Path, best: str = "alps", methods: Se
     """The same of some methods, a line for each figure: the ratio of every seed, and p of both tests after Holm's."""
     compared = {m: found for m, found in _compared_methods(task, errors, best).items() if m in methods}
     lines = head("method", "figure", f"over {best}", "of each seed", "p, trajectories", "p, seeds")
-    over_rows = {key: _adjusted({m: c[key].p for m, c in compared.items() if key in c}) for key in FIGURES}
-    over_seeds = {
-        key: _adjusted({m: p for m, c in compared.items() if key in c and (p := c[key].p_seeds) is not None})
-        for key in FIGURES
-    }
+    corrected = {key: _corrected({m: c[key] for m, c in compared.items() if key in c}) for key in FIGURES}
     for method, found in compared.items():
         for key, one in found.items():
-            seeds = ", ".join(f"{ratio:.3g}" for ratio in one.by_seed)
-            p_seeds = f"{over_seeds[key][method]:.2g}" if method in over_seeds[key] else "-"
-            lines.append(line(method, key, _ratio(one), seeds, f"{over_rows[key][method]:.2g}", p_seeds))
+            lines.append(line(method, key, _ratio(one), _each(one), *corrected[key][method]))
     return "\n".join(lines)
+
+
+def comparisons_of_pairs(task: str, errors: Path, pairs: Sequence[tuple[str, str]] = AS_PRINTED) -> str:
+    """Markdown table: the first method of each pair over its second."""
+    lines = head("method", "over", "figure", "ratio", "of each seed", "p, trajectories", "p, seeds")
+    for key in FIGURES:
+        found = {pair: one for pair in pairs if (one := compare(errors, task, *pair, key)) is not None}
+        corrected = _corrected({" ".join(pair): one for pair, one in found.items()})
+        for pair, one in found.items():
+            lines.append(line(*pair, key, _ratio(one), _each(one), *corrected[" ".join(pair)]))
+    return "\n".join(lines)
+
+
+def compare(folder: Path, task: str, method: str, over: str, figure: str) -> MethodComparison | None:
+    """One method over another in "SE" or "PE", over the seeds that both have; None where nothing can be compared."""
+    reference = _errors(folder, task, over)
+    return _compared(_errors(folder, task, method), reference, figure) if reference else None
 
 
 def _compared_methods(task: str, folder: Path, best: str) -> dict[str, dict[str, MethodComparison]]:
@@ -90,8 +104,9 @@ def _compared(
     one: Mapping[int, TrajectoryErrors], other: Mapping[int, TrajectoryErrors], key: str
 ) -> MethodComparison | None:
     """One method over another in a figure, over the seeds that both have; None where one has no such figure."""
-    pairs = [(one[seed][key], other[seed][key]) for seed in one if seed in other and key in one[seed]]
-    if not pairs or key not in next(iter(other.values())):
+    seeds = tuple(seed for seed in sorted(one) if seed in other and key in one[seed])
+    pairs = [(one[seed][key], other[seed][key]) for seed in seeds if key in other[seed]]
+    if not pairs:
         return None
     rng = np.random.default_rng(0)
     ratios = []
@@ -105,6 +120,7 @@ def _compared(
     low, high = np.quantile(ratios, [0.025, 0.975])
     left, right = (np.concatenate(side) for side in zip(*pairs, strict=True))
     return MethodComparison(
+        seeds=seeds,
         ratio=float(np.mean(left) / np.mean(right)),
         low=float(low),
         high=float(high),
@@ -122,6 +138,13 @@ def _over_seeds(ratios: Sequence[float]) -> float | None:
     return float(stats.ttest_1samp(logarithms, 0.0).pvalue)
 
 
+def _corrected(compared: Mapping[str, MethodComparison]) -> dict[str, tuple[str, str]]:
+    """p over trajectories and over seeds of each method after Holm's correction, as a table says them."""
+    rows = _adjusted({name: one.p for name, one in compared.items()})
+    seeds = _adjusted({name: one.p_seeds for name, one in compared.items() if one.p_seeds is not None})
+    return {name: (f"{rows[name]:.2g}", f"{seeds[name]:.2g}" if name in seeds else "-") for name in compared}
+
+
 def _adjusted(p: Mapping[str, float]) -> dict[str, float]:
     """Holm's correction: the p of each of several tests, so that any false rejection among them has that chance."""
     highest, found = 0.0, {}
@@ -129,6 +152,10 @@ def _adjusted(p: Mapping[str, float]) -> dict[str, float]:
         highest = max(highest, min(1.0, (len(p) - rank) * p[name]))
         found[name] = highest
     return found
+
+
+def _each(compared: MethodComparison) -> str:
+    return ", ".join(f"{ratio:.3g}" for ratio in compared.by_seed)
 
 
 def _ratio(compared: MethodComparison) -> str:

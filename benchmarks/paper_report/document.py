@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed
+from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed, comparisons_of_pairs
 from sprung.benchmarks.paper_report.tables import name_of, seeds_of, table
 from sprung.benchmarks.paper_report.targets import targets
 from sprung.benchmarks.paper_settings import EXTRA, sources
@@ -85,6 +85,12 @@ def _against_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     return comparisons(task, folder / "errors")
 
 
+def _printed_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    """The baselines as printed over the same with the help that ALPS gets."""
+    del rows, before
+    return comparisons_of_pairs(task, folder / "errors")
+
+
 def _targets_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     del task, folder
     return targets(rows, before)
@@ -101,12 +107,23 @@ def _variants_place(task: str, rows: Rows, folder: Path, before: str) -> str:
 KINDS: dict[str, Callable[[str, Rows, Path, str], str]] = {
     "rows": _rows_place,
     "against": _against_place,
+    "printed": _printed_place,
     "targets": _targets_place,
     "variants": _variants_place,
 }
 
 
 def _made(rows: Rows) -> str:
+    """Commits, seeds, and with which vector instructions, of which seeds where they differ."""
     commits = ", ".join(sorted({f"`{row['commit']}`" for row in rows}))
-    several = "s" if "," in seeds_of(rows) else ""
-    return f"Made at {commits}, seed{several} {seeds_of(rows)}."
+    found: dict[str, Rows] = {}
+    for row in rows:
+        found.setdefault(str(row.get("arithmetic", "")), []).append(row)
+    with_seeds = [
+        f"{name} ({_seeds(same)})" if len(found) > 1 else name for name, same in sorted(found.items()) if name
+    ]
+    return "; ".join([f"Made at {commits}, {_seeds(rows)}", *with_seeds]) + "."
+
+
+def _seeds(rows: Rows) -> str:
+    return f"seed{'s' if ',' in seeds_of(rows) else ''} {seeds_of(rows)}"

@@ -82,7 +82,7 @@ def test_comparisons_are_paired_and_separate_the_better_from_the_equal(tmp_path:
     cells = {line.split("|")[1].strip(): [cell.strip() for cell in line.split("|")[2:]] for line in table[2:]}
     assert set(cells) == {"cdm", "no_attention"}
     assert float(cells["cdm"][2]) < 1e-6 and float(cells["no_attention"][2]) > 0.01
-    assert cells["cdm"][1].startswith("1.") and cells["cdm"][3] == "-"
+    assert cells["cdm"][1].startswith("1.") and cells["cdm"][4] == "-"
 
 
 def test_rows_of_other_code_are_refused(tmp_path: Path) -> None:

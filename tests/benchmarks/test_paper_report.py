@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks import paper_report, rerun_paper
-from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed
+from sprung.benchmarks.paper_report import compare
+from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed, comparisons_of_pairs
 from sprung.benchmarks.paper_settings import sources
 from sprung.service.errors import UserError
 
@@ -112,3 +113,31 @@ def test_the_smallest_p_is_corrected_for_the_number_of_methods(tmp_path: Path) -
     beside = lines(comparisons("pendulum", tmp_path / "errors"))
     assert float(beside["no_phases"][3]) == pytest.approx(2 * alone, rel=0.02)
     assert beside["no_opening"][2:4] == ["1 (1 to 1)", "1"]
+
+
+def test_any_two_methods_can_be_held_against_each_other(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    for seed in range(3):
+        base = rng.uniform(1, 2, 60)
+        keep_errors(tmp_path, "cdm", seed, SE=base)
+        keep_errors(tmp_path, "cdm_plain", seed, SE=1.5 * base * rng.uniform(0.9, 1.1, 60))
+    keep_errors(tmp_path, "cdm_plain", 7, SE=np.ones(60))  # of a seed that the other has not
+    (row,) = compare.run("pendulum", "cdm_plain", over="cdm", data=tmp_path)
+    assert row["seeds"] == [0, 1, 2] and row["figure"] == "SE"
+    assert row["interval"][0] < row["ratio"] < row["interval"][1]
+    assert row["ratio"] == pytest.approx(1.5, rel=0.03) and row["by_seed"] == pytest.approx([1.5] * 3, rel=0.03)
+    assert row["p_trajectories"] < 1e-20 and row["p_seeds"] < 0.01
+    (said,) = comparisons_of_pairs("pendulum", tmp_path / "errors").splitlines()[2:]
+    assert said.startswith(f"| cdm_plain | cdm | SE | {row['ratio']:.3g} (")
+    with pytest.raises(UserError, match="no errors of zero and cdm on pendulum"):
+        list(compare.run("pendulum", "zero", over="cdm", data=tmp_path))
+
+
+def test_tables_say_which_seeds_have_other_arithmetic(tmp_path: Path) -> None:
+    for seed, arithmetic in ((0, "AVX2"), (1, "AVX2"), (2, "AVX512")):
+        keep(tmp_path, "alps", seed, SE=1.0, arithmetic=arithmetic)
+    document = tmp_path / "paper.md"
+    document.write_text(PAGE)
+    paper_report.refresh(tmp_path, document, ["rows"])
+    assert "Made at `abc`, seeds 0, 1, 2; AVX2 (seeds 0, 1); AVX512 (seed 2)." in document.read_text()
+    assert {cell.seeds for cell in rerun_paper.stated(document.read_text())} == {(0, 1, 2)}
