@@ -12,10 +12,11 @@ from typing import Any
 import can
 
 from sprung.replay.account import UnreadableRecording
+from sprung.replay.canlink import listens_only
 from sprung.replay.frames import EXTENDED
 
 # options of python-can that keep an interface from sending anything, acknowledgements included.  SocketCAN is told so
-# when the interface is brought up (`ip link set can0 type can bitrate 500000 listen-only on`), not when it is opened.
+# when the interface is brought up, not when it is opened: `not_only_listened_to`
 LISTEN_ONLY: dict[str, dict[str, Any]] = {
     "vector": {"listen_only": True},
     "slcan": {"listen_only": True},
@@ -75,6 +76,17 @@ def opening_options(address: BusAddress, ids: Iterable[int] | None) -> dict[str,
             for frame_id in ids
         ]
     return options | address.options
+
+
+def not_only_listened_to(address: BusAddress) -> str:
+    """What to do about an interface whose controller takes part in the traffic; empty where it only listens, or where
+    nothing is known of it."""
+    if address.interface != "socketcan" or listens_only(address.channel) is not False:
+        return ""
+    return (
+        "the controller acknowledges frames and sends error frames; to listen only: "
+        f"`ip link set {address.channel} down`, then `ip link set {address.channel} up type can listen-only on`"
+    )
 
 
 def widen(bus: can.BusABC) -> None:

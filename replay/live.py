@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -15,13 +16,14 @@ from cantools.database import Database
 
 from sprung.model.signals import Channel, SampleBlock, Tally
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.bus import BusAddress, lost_by_kernel, opening_options, widen
+from sprung.replay.bus import BusAddress, lost_by_kernel, not_only_listened_to, opening_options, widen
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import EXTENDED, FrameBlock
 from sprung.replay.plausibility import OUT_OF_TIME, PlausibilityCheck, nanoseconds
 from sprung.replay.recording import CAN_READERS
 
+log = logging.getLogger("sprung.live")
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0  # s, doubled from try to try
 MOST_FRAMES = 4096  # frames of one block, so that a flooded bus stays bounded in memory
 BUS_ERRORS = (can.CanError, OSError, ValueError)
@@ -75,6 +77,7 @@ class LiveBus:
         self._lost_before = 0
         self._behind = False
         self._asked = 0.0
+        self._told = False  # who has to know that it is not only listened to
         self._decoder = CanDecoder(channels, dbc)
         self._plausibility = PlausibilityCheck(channels, self.account, converter(channels))
         self._ids = frozenset(self._decoder.ids.tolist())
@@ -159,6 +162,10 @@ class LiveBus:
         self.connected, self.trouble = True, ""
         self._offset, self._behind, self.lag = math.inf, False, 0.0
         self._lost_before = lost_by_kernel(bus, self.address)
+        if not self._told:
+            self._told = True
+            if advice := not_only_listened_to(self.address):
+                log.warning("%s: %s", self.name, advice)
 
     def _ask(self, bus: can.BusABC) -> None:
         """Add the frames dropped by the kernel since the last call."""

@@ -26,6 +26,7 @@ from sprung.replay.stamps import SECOND
 from sprung.replay.tables import MOST_COLUMNS, Column, EvenTimes, whole
 
 DEEPEST = 8  # structures inside each other
+DEEPEST_GROUP = 64  # of HDF5: the library takes minutes for thousands of levels
 
 
 @contextmanager
@@ -133,6 +134,8 @@ def _hdf5(path: Path) -> Iterator[list[Column]]:
         found: list[Column] = []
 
         def visit(name: str, item: Any) -> None:
+            if name.count("/") >= DEEPEST_GROUP:
+                raise UnreadableRecording(f"{path}: holds groups more than {DEEPEST_GROUP} deep inside each other")
             if isinstance(item, h5py.Dataset) and not name.startswith("#") and item.shape is not None:
                 _check_own(path, name, item)
                 found.extend(_checked(path, item, column) for column in _datasets(name, item))

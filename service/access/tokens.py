@@ -97,12 +97,17 @@ class Tokens:
         return text, row
 
     def rotate(self, token_id: str, hours: float = 24.0, by: str = "local") -> tuple[str, TokenRow]:
-        """A new token like an old one, which ends in `hours`.  Raises NotFound."""
+        """A new token like an old one, which ends in `hours`.
+
+        Raises NotFound, and UserError for an old one that is worth nothing any more: it would come to life again.
+        """
         with self._store.read() as connection:
             old = tokens.get(connection, token_id)
-        if old is None or old.revoked_ns is not None:
+        if old is None:
             raise NotFound(f"no token {token_id[:40]!r}")
         now = self._clock()
+        if (wrong := _worthless(old, now)) is not None:
+            raise UserError(f"token {token_id}: {wrong}; make a new one")
         left = None if old.expires_ns is None else max((old.expires_ns - old.created_ns) / DAY, 1e-6)
         text, row = self.create(old.name, old.scopes, old.fleet, left, by)
         with self._store.write() as connection:
@@ -184,10 +189,8 @@ class Tokens:
         return found.owner()
 
     def _valid(self, row: TokenRow) -> Actor:
-        if row.revoked_ns is not None:
-            raise Refused("the token was revoked")
-        if row.expires_ns is not None and row.expires_ns <= self._clock():
-            raise Refused("the token has expired")
+        if (wrong := _worthless(row, self._clock())) is not None:
+            raise Refused(f"the token {wrong}")
         return Actor(row.name, frozenset(row.scopes), row.fleet)
 
     def _row(self, token_id: str) -> TokenRow | None:
@@ -208,6 +211,13 @@ class Tokens:
         with self._lock:
             self._known.clear()
         self._counted = (-1e9, False)
+
+
+def _worthless(row: TokenRow, now: int) -> str | None:
+    """Why a token is no good any more, None while it is."""
+    if row.revoked_ns is not None:
+        return "was revoked"
+    return "has expired" if row.expires_ns is not None and row.expires_ns <= now else None
 
 
 def digest_of(text: str) -> str:

@@ -19,7 +19,7 @@ from sprung import __version__
 from sprung.model.identification.identify import Identifier, load_identifier, without_weights
 from sprung.model.system import load_system
 from sprung.model.text import counted
-from sprung.replay.bus import opening_options, parse_bus
+from sprung.replay.bus import not_only_listened_to, opening_options, parse_bus
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
 from sprung.service.store.status import StatusFilter, health_counts
@@ -156,4 +156,7 @@ def _bus(name: str) -> Check:
         return Check("failed", f"bus {name}", " ".join(str(error).split()) or type(error).__name__)
     if not count:
         return Check("warning", f"bus {name}", f"open, but silent for {BUS_SECONDS:g} s; check cable and bit rate")
-    return Check("ok", f"bus {name}", f"{count / BUS_SECONDS:.0f} frames a second")
+    rate = f"{count / BUS_SECONDS:.0f} frames a second"
+    if advice := not_only_listened_to(address):
+        return Check("warning", f"bus {name}", f"{rate}; {advice}")
+    return Check("ok", f"bus {name}", rate)

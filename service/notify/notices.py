@@ -30,6 +30,7 @@ log = logging.getLogger("sprung.notify")
 PAUSES = (5, 30, 120, 600, 1800, 3600, 10_800, 21_600, 43_200, 86_400)  # s before the next attempt
 KEPT_DAYS = 30
 PERIOD_SECONDS = 2.0
+FEED_KINDS = (events.FEED_LOST, events.FEED_FOUND)
 FORGET_SECONDS = 3600
 AT_ONCE = 50  # deliveries to one receiver before it is the next one's turn
 TURN_SECONDS = 2.0  # after which a receiver's turn ends with the attempt that is being made
@@ -43,7 +44,7 @@ class Notices:
         self._settings = settings
         self._store = store
         self._feeds = feeds
-        self._working: dict[str, bool] = {}
+        self._working: dict[str, bool] = {}  # as told last, by bus
         self._targets = receivers(settings)
         senders.signing_key(settings.webhook_secret)  # wrong ones are told now
         self._allowed = outside.networks(settings.webhook_networks)
@@ -73,8 +74,13 @@ class Notices:
         self._accept(connection, events.report_event(base, vehicle, report, verdict, findings, now_ns()))
 
     def watch_feeds(self) -> None:
-        """Tell of live buses that were lost or found since the last call."""
-        for feed in self._feeds():
+        """Tell of live buses that were lost or found since they were told of last, by this process or one before."""
+        feeds = self._feeds()
+        if any(feed.name not in self._working for feed in feeds):
+            with self._store.read() as connection:
+                told = outbox.newest_of_sources(connection, FEED_KINDS)
+            self._working = {name: kind == events.FEED_FOUND for name, kind, _ in told} | self._working
+        for feed in feeds:
             if self._working.get(feed.name, True) != feed.works:
                 base = self._settings.public_url
                 event = events.feed_event(base, feed.name, feed.vehicle, feed.works, feed.detail, now_ns())
@@ -132,7 +138,8 @@ class Notices:
                 if now_ns() - forgotten > FORGET_SECONDS * NANOSECONDS:
                     forgotten = now_ns()
                     with self._store.write() as connection:
-                        outbox.forget_deliveries(connection, forgotten - KEPT_DAYS * 86_400 * NANOSECONDS)
+                        kept = [row for *_, row in outbox.newest_of_sources(connection, FEED_KINDS)]
+                        outbox.forget_deliveries(connection, forgotten - KEPT_DAYS * 86_400 * NANOSECONDS, kept)
             except Exception:  # the store, or no thread for a time-out: nothing else would send what waits
                 log.exception("notifications could not be sent; they are tried again")
 

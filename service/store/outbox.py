@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, delete, insert, select, update
+from sqlalchemy import Connection, and_, delete, func, insert, select, update
 
 from sprung.service.store.schema import deliveries
 
@@ -50,7 +51,18 @@ def settle(connection: Connection, delivery: str, now: int, **values: Any) -> No
     connection.execute(update(deliveries).where(deliveries.c.id == delivery).values(updated_ns=now, **values))
 
 
-def forget_deliveries(connection: Connection, before: int) -> int:
-    """Delete delivered and dead ones that were settled before a time."""
-    done = deliveries.c.state != "waiting"
-    return connection.execute(delete(deliveries).where(done, deliveries.c.updated_ns < before)).rowcount
+def newest_of_sources(connection: Connection, kinds: Collection[str]) -> list[tuple[str, str, str]]:
+    """(source, kind, id) of the newest events of these kinds, by the source that they tell of."""
+    source = deliveries.c.event["data"]["source"].as_string().label("source")
+    query = select(deliveries.c.id, deliveries.c.kind, deliveries.c.created_ns, source)
+    told = query.where(deliveries.c.kind.in_(kinds)).subquery()
+    last = select(told.c.source, func.max(told.c.created_ns).label("at")).group_by(told.c.source).subquery()
+    newest = and_(told.c.source == last.c.source, told.c.created_ns == last.c.at)
+    found = connection.execute(select(told.c.source, told.c.kind, told.c.id).join(last, newest))
+    return [(row.source, row.kind, row.id) for row in found]
+
+
+def forget_deliveries(connection: Connection, before: int, kept: Collection[str] = ()) -> int:
+    """Delete delivered and dead ones that were settled before a time, but for those that are `kept`, by their ids."""
+    old = (deliveries.c.state != "waiting", deliveries.c.updated_ns < before, deliveries.c.id.not_in(kept))
+    return connection.execute(delete(deliveries).where(*old)).rowcount

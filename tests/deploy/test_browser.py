@@ -476,7 +476,7 @@ def test_an_upload_is_followed_to_its_report_and_what_was_found_is_put_to_use(
     dialog = page.locator("dialog#usemodel[open]")
     dialog.wait_for()
     assert "Use this model for car-18" in dialog.inner_text()
-    kept(page, "use-this-model")
+    kept(page, "use-this-model", whole=False)
     page.keyboard.press("Escape")  # thought better of it
     assert core.pipeline.state("car-18").used and page.locator("dialog[open]").count() == 0
     page.get_by_role("button", name="Use this model").first.click()
@@ -501,7 +501,8 @@ def test_people_sign_in_with_their_organisation(engine: Engine, browser: Any, tm
             page.close()
 
 
-def kept(page: Any, name: str) -> None:
+def kept(page: Any, name: str, whole: bool = True) -> None:
+    """Keep a picture for the documents: of the whole page, or of what a person sees at once (a dialog)."""
     if folder := os.environ.get("SPRUNG_SHOTS"):
         page.wait_for_timeout(900)
-        page.screenshot(path=Path(folder) / f"{name}.png", full_page=True)
+        page.screenshot(path=Path(folder) / f"{name}.png", full_page=whole)

@@ -58,6 +58,21 @@ def test_probes_ask_routes_that_need_no_token() -> None:
         assert need_of("GET", path).scope == ""
 
 
+def test_ray_s_head_finds_the_redis_that_the_example_brings() -> None:
+    documents = list(yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()))
+    kinds = {(one["kind"], one["metadata"]["name"]): one["spec"] for one in documents if "spec" in one}
+    options = kinds["RayService", "sprung-ingest"]["rayClusterConfig"]["gcsFaultToleranceOptions"]
+    name, _, port = options["redisAddress"].partition(":")
+    service, pods = kinds["Service", name], kinds["StatefulSet", name]
+    assert [str(one["port"]) for one in service["ports"]] == [port]
+    [redis] = pods["template"]["spec"]["containers"]
+    assert [str(one["containerPort"]) for one in redis["ports"]] == [port]
+    assert service["selector"] == pods["selector"]["matchLabels"] == pods["template"]["metadata"]["labels"]
+    assert redis["env"][0]["valueFrom"] == options["redisPassword"]["valueFrom"]  # the same secret on both sides
+    claims = {claim["metadata"]["name"] for claim in pods["volumeClaimTemplates"]}
+    assert {mount["name"] for mount in redis["volumeMounts"]} == claims  # and it outlives the pod
+
+
 def test_the_application_that_ray_imports_is_there() -> None:
     document = next(
         d for d in yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()) if d["kind"] == "RayService"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import time
 import zlib
 from pathlib import Path
 
@@ -38,6 +39,20 @@ def test_a_table_of_a_billion_rows_that_were_never_written_is_refused(tmp_path: 
         for name in ("time", "left", "right"):
             file.create_dataset(name, (10**12,), "f8", chunks=(1000,))
     assert "states 2000000000000 values" in refused(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("branches", [1, 40])
+def test_groups_thousands_of_levels_inside_each_other_are_refused(tmp_path: Path, branches: int) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w", libver="latest") as file:
+        for branch in range(branches):
+            group = file.create_group(f"b{branch}")
+            for _ in range(3000 // branches):
+                group = group.create_group("g")
+            group["x"] = np.arange(100.0)
+    begun = time.process_time()
+    assert refused(tmp_path / "a.h5").endswith("holds groups more than 64 deep inside each other")
+    assert time.process_time() - begun < 1.0
 
 
 @pytest.mark.parametrize("kind", ["external", "virtual", "itself"])

@@ -22,7 +22,7 @@ from sprung.service.api.problems import ApiProblem
 from sprung.service.api.scopes import NEEDS, need_of
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
-from sprung.service.errors import UserError
+from sprung.service.errors import NotFound, UserError
 from sprung.service.fleet.message import MEDIA_TYPE, Message, WindowEstimate, encode
 from sprung.service.main import Feeds, serve
 from sprung.service.monitoring.engine import Engine
@@ -241,6 +241,20 @@ def test_a_token_is_rotated_and_the_old_one_ends(store: Store) -> None:
     with pytest.raises(Refused, match="expired"):
         found.actor(text)
     assert found.actor(new).name == "feeder"
+
+
+def test_a_token_that_is_worth_nothing_is_not_rotated(store: Store) -> None:
+    now = time.time_ns()
+    found = Tokens(store, clock=lambda: now)
+    (_, gone), (_, ended) = found.create("a", ["read"]), found.create("b", ["read"], days=1)
+    found.revoke(gone.id)
+    now += DAY
+    for row, why in ((gone, "was revoked"), (ended, "has expired")):
+        with pytest.raises(UserError, match=f"token {row.id}: {why}; make a new one"):
+            found.rotate(row.id)
+    assert len(found.rows()) == 2
+    with pytest.raises(NotFound):
+        found.rotate("0" * 12)
 
 
 @pytest.mark.parametrize(("scopes", "days"), [([], 1), (["rule"], 1), (["read"], 0), (["read"], -1), (["read"], 1e9)])

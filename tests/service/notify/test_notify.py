@@ -30,13 +30,14 @@ from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.views import changed_part
 from sprung.service.monitoring.words import spoken
 from sprung.service.notify.events import alarm_event, sentence
-from sprung.service.notify.notices import AT_ONCE, PAUSES, Notices
+from sprung.service.notify.notices import AT_ONCE, FEED_KINDS, PAUSES, Notices
 from sprung.service.notify.senders import signature
 from sprung.service.settings import Settings
 from sprung.service.sources.live import FeedStatus
 from sprung.service.store import Store
 from sprung.service.store.fleet import AlarmChange
 from sprung.service.store.lists import list_deliveries
+from sprung.service.store.outbox import forget_deliveries, newest_of_sources, settle
 from sprung.service.times import NANOSECONDS, now_ns
 from tests.service_fakes import make_window
 
@@ -233,6 +234,35 @@ def test_a_lost_bus_is_reported_once_and_told_when_it_is_back(tmp_path: Path, st
     with store.read() as connection:
         kinds = sorted(row.kind for row in list_deliveries(connection, 10))
     assert kinds == ["sprung.feed.found", "sprung.feed.lost"]
+
+
+@pytest.mark.parametrize("days", [0, 40])
+def test_a_bus_that_is_lost_is_told_once_over_starts(tmp_path: Path, any_store: Store, days: int) -> None:
+    """A service that is started anew goes on with what was told, however long ago that was."""
+    settings = Settings(data_dir=tmp_path, webhooks=("http://127.0.0.1:1/",), webhook_networks=("127.0.0.0/8",))
+    states = {"socketcan:can0": "receiving", "socketcan:can1": "down"}
+
+    def started() -> Notices:
+        names = [FeedStatus(name, "car-17", state, "", 0.0, 0, 0, 0, 0, 0) for name, state in states.items()]
+        return Notices(settings, any_store, lambda: names)
+
+    def told() -> list[str]:
+        with any_store.read() as connection:
+            rows = sorted(list_deliveries(connection, 10), key=lambda row: row.created_ns)
+        return [f"{row.kind.removeprefix('sprung.feed.')} {row.event['data']['source'][-1]}" for row in rows]
+
+    started().watch_feeds()
+    assert told() == ["lost 1"]
+    with any_store.write() as connection:
+        kept = [row for *_, row in newest_of_sources(connection, FEED_KINDS)]
+        settle(connection, kept[0], now_ns() - days * 86_400 * NANOSECONDS, state="dead")
+        assert forget_deliveries(connection, now_ns() - 30 * 86_400 * NANOSECONDS, kept) == 0
+    started().watch_feeds()
+    assert told() == ["lost 1"]
+    states = {"socketcan:can0": "down", "socketcan:can1": "receiving"}
+    for _ in range(2):
+        started().watch_feeds()
+        assert sorted(told()) == ["found 1", "lost 0", "lost 1"]
 
 
 def test_a_served_bus_that_is_lost_is_reported(engine: Engine, data_dir: Path) -> None:
