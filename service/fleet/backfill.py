@@ -1,8 +1,11 @@
 """Back-fill: recordings -> windows -> estimates, in any order and anywhere; then every vehicle's fold in order of time.
 
 A file's estimates are a pure function of the file, and a vehicle's fold of one file depends on the fold of the file
-before it: that is all that is said to whoever does the work (`service.fleet.tasks`).  What is made lies under a model
-of its own (`staging:...`), unseen, until `swap` puts it in place vehicle by vehicle.
+before it: that is all that is said to whoever does the work (`service.fleet.tasks`).  Windows of a vehicle whose
+tracker knows of faults of its measurements are identified once more while they are folded, as a replay does that knows
+of them.
+
+What is made lies under a model of its own (`staging:...`), unseen, until `swap` puts it in place vehicle by vehicle.
 """
 
 from __future__ import annotations
@@ -13,13 +16,13 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sprung.model.signals import Window
+from sprung.model.signals import Estimate, MeasurementFault, Window
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
 from sprung.service.fleet.tasks import Tasks, WorkLost
@@ -27,11 +30,12 @@ from sprung.service.jobs.recordings import reading_limits
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine, load_engine
 from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.monitoring.processed import FaultsChanged, FoldedWindows
 from sprung.service.processes.worker import ProcessLimits, carried_out
 from sprung.service.settings import Settings
 from sprung.service.sources.feed import vehicle_of
 from sprung.service.sources.loading import RecordRequest, head_task
-from sprung.service.sources.reading import ReadRequest, reading_of
+from sprung.service.sources.reading import Reading, ReadRequest, reading_of
 from sprung.service.store import Store, fleet, open_store, status, work
 from sprung.service.store.partitions import prepare
 from sprung.service.store.staging import staging_digest, swap
@@ -219,26 +223,11 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
     """Estimates of a file's windows."""
     engine = engine_of(plan.settings)
     messages: list[bytes] = []
-
-    def add(windows: list[Window]) -> None:
-        chosen = [w for w in windows if plan.since <= w.start < plan.until]
-        whole = [w for w in chosen if w.outcome != "dropped"]
-        found: Iterator[Any] = iter(())
-        if whole:
-            estimates, _ = engine.identify(np.stack([w.values for w in whole]), starts=[w.start for w in whole])
-            found = iter(estimates)
-        sent = [WindowEstimate.of(w, None if w.outcome == "dropped" else next(found)) for w in chosen]
-        if sent:
-            messages.append(encode(Message(file.vehicle, engine.digest, tuple(sent)), "exact"))
-
     try:
-        with local_copy(file) as path, ExitStack() as stack:
-            together = plan.settings.batch_windows  # as when it is replayed, so that estimates are the same bit by bit
-            request = ReadRequest(path, engine.system, engine.dbc, together, start=file.modified_ns or None)
-            reading = reading_of(request, _limits(plan, path))
-            stack.callback(reading.close)
-            for piece in reading.pieces(lambda: None):
-                add(piece.windows)
+        with read_again(plan, file) as reading:
+            for chosen in _chosen(plan, reading):
+                sent = _identified(engine, chosen, ())
+                messages.append(encode(Message(file.vehicle, engine.digest, sent), "exact"))
             ending = reading.ending
     except Exception as error:  # the others go on
         return IdentifiedFile(file, tuple(messages), True, message_of(error))
@@ -246,10 +235,44 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
     return IdentifiedFile(file, tuple(messages), ending.incomplete, problem)
 
 
+@contextmanager
+def read_again(plan: BackfillPlan, file: FoundFile) -> Iterator[Reading]:
+    """A file that is read in pieces as when it is replayed, so that estimates are the same bit by bit."""
+    engine = engine_of(plan.settings)
+    with local_copy(file) as path:
+        together = plan.settings.batch_windows
+        request = ReadRequest(path, engine.system, engine.dbc, together, start=file.modified_ns or None)
+        reading = reading_of(request, _limits(plan, path))
+        try:
+            yield reading
+        finally:
+            reading.close()
+
+
+def _chosen(plan: BackfillPlan, reading: Reading) -> Iterator[list[Window]]:
+    """The windows of each piece that lie in the times of the plan, where there are any."""
+    for piece in reading.pieces(lambda: None):
+        if chosen := [w for w in piece.windows if plan.since <= w.start < plan.until]:
+            yield chosen
+
+
+def _identified(
+    engine: Engine, windows: list[Window], faults: tuple[MeasurementFault, ...]
+) -> tuple[WindowEstimate, ...]:
+    """Windows identified together; faults: of the vehicle's measurements, that are put right before."""
+    whole = [w for w in windows if w.outcome != "dropped"]
+    found: Iterator[Estimate] = iter(())
+    if whole:
+        values, known = np.stack([w.values for w in whole]), [faults] * len(whole)
+        found = iter(engine.identify(values, starts=[w.start for w in whole], known=known)[0])
+    return tuple(WindowEstimate.of(w, None if w.outcome == "dropped" else next(found)) for w in windows)
+
+
 def fold_file(plan: BackfillPlan, found: IdentifiedFile, before: FoldedFile | None) -> FoldedFile:
     """Fold a file's estimates into its vehicle's tracker, after those of the file `before`."""
     count, known = 0, 0
-    with staging_pipeline(plan) as pipeline:
+    with staging_pipeline(plan) as pipeline, ExitStack() as stack:
+        pieces = _Pieces(plan, found.file, stack)
         row = RecordingRow(
             _row_id(plan, found.file),
             None,
@@ -264,24 +287,68 @@ def fold_file(plan: BackfillPlan, found: IdentifiedFile, before: FoldedFile | No
         with pipeline.store.write() as connection:
             if work.get_recording(connection, row.id) is None:
                 work.add_recording(connection, row)
-        system = pipeline.engine.system
-        for body in found.messages:
-            message = decode(body)
-            windows = [w.window(system.sample_rate, len(system.channels)) for w in message.windows]
-            prepare(pipeline.store, (w.start for w in windows))
-            with pipeline.store.write() as connection:
-                folded = pipeline.fold(
-                    connection, found.file.vehicle, windows, [w.estimate for w in message.windows], row.id
-                )
+        for number, body in enumerate(found.messages):
+            try:
+                folded = _folded(pipeline, found.file.vehicle, decode(body).windows, row.id, partial(pieces.at, number))
+            except UnreadableAgain as error:
+                return FoldedFile(found.file, count, known, True, str(error))
             pipeline.settle(folded)
             count += len(folded.batch.fresh)
-            known += len(windows) - len(folded.batch.fresh)
+            known += len(folded.batch.records) - len(folded.batch.fresh)
         if not found.problem or found.messages:
             with pipeline.store.write() as connection:
                 tally = {"windows": count, "incomplete": found.incomplete, "problem": found.problem}
                 vehicle = found.file.vehicle if count or known else None
                 work.finish_recording(connection, row.id, vehicle, tally, now_ns())
     return FoldedFile(found.file, count, known, found.incomplete, found.problem)
+
+
+def _folded(
+    pipeline: Pipeline,
+    vehicle: str,
+    sent: tuple[WindowEstimate, ...],
+    recording: str,
+    samples: Callable[[], list[Window]],
+) -> FoldedWindows:
+    """Windows that are folded and stored; `samples`: the same windows with what was measured."""
+    system = pipeline.engine.system
+    faults: tuple[MeasurementFault, ...] = ()
+    prepare(pipeline.store, (w.start for w in sent))
+    while True:
+        windows = [w.window(system.sample_rate, len(system.channels)) for w in sent]
+        estimates = [w.estimate for w in sent]
+        try:
+            with pipeline.store.write() as connection:
+                return pipeline.fold(connection, vehicle, windows, estimates, recording, faults=faults)
+        except FaultsChanged as changed:
+            faults = changed.faults
+            sent = _identified(pipeline.engine, samples(), faults)
+
+
+class UnreadableAgain(Exception):
+    """A file that was read before cannot be read any more; one line."""
+
+
+class _Pieces:
+    """A file's windows with their samples, piece by piece; read when they are first asked for."""
+
+    def __init__(self, plan: BackfillPlan, file: FoundFile, stack: ExitStack) -> None:
+        self._plan, self._file, self._stack = plan, file, stack
+        self._read: Iterator[list[Window]] | None = None
+        self._piece: list[Window] = []
+        self._next = 0
+
+    def at(self, number: int) -> list[Window]:
+        """Piece `number`; they are asked for in order, not necessarily all.  Raises UnreadableAgain."""
+        try:
+            if self._read is None:
+                self._read = _chosen(self._plan, self._stack.enter_context(read_again(self._plan, self._file)))
+            while self._next <= number:
+                self._piece = next(self._read)
+                self._next += 1
+        except Exception as error:  # whatever it is: the other files go on
+            raise UnreadableAgain(message_of(error)) from error
+        return self._piece
 
 
 def swap_vehicle(plan: BackfillPlan, vehicle: str) -> bool:

@@ -21,6 +21,7 @@ from sprung.service.monitoring.engines import Engines, ServedModel
 from sprung.service.monitoring.following import FollowedWindows, Following, follow
 from sprung.service.monitoring.processed import (
     Batch,
+    FaultsChanged,
     FoldedWindows,
     HeldVehicle,
     IdentifiedBatch,
@@ -102,23 +103,40 @@ class Pipeline:
         """
         return self.keep(self.identify(vehicle, windows, priority), recording_id)
 
-    def identify(self, vehicle: str, windows: Sequence[Window], priority: Priority = Priority.BATCH) -> IdentifiedBatch:
-        """The first half of `process`: may run while the batch before is still tracked and stored."""
+    def identify(
+        self,
+        vehicle: str,
+        windows: Sequence[Window],
+        priority: Priority = Priority.BATCH,
+        faults: tuple[MeasurementFault, ...] | None = None,
+    ) -> IdentifiedBatch:
+        """The first half of `process`: may run while the batch before is still tracked and stored.
+
+        faults: of the vehicle's measurements; None: as its tracker in memory knows them.
+        """
         with self.store.read() as connection:
             served = self.engines.of(connection, vehicle)
             known = known_windows(connection, vehicle, served.model_id, [w.start for w in windows])
         fresh = [w for w in windows if w.start not in known]
-        estimates, seconds = self._identify(vehicle, served, fresh, priority)
-        return IdentifiedBatch(vehicle, served, windows, known, fresh, estimates, seconds)
+        if faults is None:
+            faults = self.known_faults(vehicle, served)
+        estimates, seconds = self._identify(served, fresh, faults, priority)
+        return IdentifiedBatch(vehicle, served, windows, known, fresh, estimates, faults, priority, seconds)
 
     def keep(self, found: IdentifiedBatch, recording_id: str | None = None) -> Batch:
-        """The second half of `process`: track and store, in order of time."""
+        """The second half of `process`: track and store, in order of time.
+
+        Windows are identified anew where the tracker, after those before them, knows of other faults than they were
+        identified with: what comes out does not depend on how far the halves overlapped, or where a run was stopped.
+        """
         while True:
             try:
-                batch = self._commit(found.vehicle, found.fresh, found.estimates, recording_id, found.served)
+                batch = self._commit(found, recording_id)
                 break
             except ModelChanged:
-                found = self.identify(found.vehicle, found.windows)
+                found = self.identify(found.vehicle, found.windows, found.priority)
+            except FaultsChanged as changed:
+                found = self.identify(found.vehicle, found.windows, found.priority, changed.faults)
         batch.seconds |= found.seconds
         if found.known:
             stored = {record.start: record for record in batch.records} | found.known
@@ -139,7 +157,11 @@ class Pipeline:
         return () if held is None or held.served is not served else served.engine.tracker.known_faults(held.state)
 
     def _identify(
-        self, vehicle: str, served: ServedModel, windows: list[Window], priority: Priority
+        self,
+        served: ServedModel,
+        windows: list[Window],
+        known: tuple[MeasurementFault, ...],
+        priority: Priority,
     ) -> tuple[list[Estimate | None], dict[str, float]]:
         """Estimates, None for dropped windows; and seconds by stage."""
         whole = [w.values for w in windows if w.outcome != "dropped"]
@@ -147,7 +169,6 @@ class Pipeline:
             return [None] * len(windows), {}
         values = np.stack(whole)  # shape (B, T, C)
         starts = [w.start for w in windows if w.outcome != "dropped"]
-        known = self.known_faults(vehicle, served)
         estimates: list[Estimate] = []
         total: dict[str, float] = {}
         while len(estimates) < len(values):
@@ -174,19 +195,20 @@ class Pipeline:
         self.pace.note(served, len(values), sum(seconds.values()))
         return estimates, seconds
 
-    def _commit(
-        self,
-        vehicle: str,
-        windows: list[Window],
-        estimates: Sequence[Estimate | None],
-        recording_id: str | None,
-        served: ServedModel,
-    ) -> Batch:
-        prepare(self.store, (window.start for window in windows))
+    def _commit(self, found: IdentifiedBatch, recording_id: str | None) -> Batch:
+        prepare(self.store, (window.start for window in found.fresh))
         with self.store.write() as connection:
-            folded = self.fold(connection, vehicle, windows, estimates, recording_id, served=served)
+            folded = self.fold(
+                connection,
+                found.vehicle,
+                found.fresh,
+                found.estimates,
+                recording_id,
+                served=found.served,
+                faults=found.faults,
+            )
             done = time.perf_counter()
-        self._remember(vehicle, folded.after)
+        self._remember(found.vehicle, folded.after)
         folded.batch.seconds["store"] += time.perf_counter() - done
         return folded.batch
 
@@ -198,11 +220,13 @@ class Pipeline:
         estimates: Sequence[Estimate | None],
         recording_id: str | None = None,
         served: ServedModel | None = None,
+        faults: tuple[MeasurementFault, ...] | None = None,
     ) -> FoldedWindows:
         """Track and store windows inside a transaction of the caller's; hand what comes back to `settle` after it.
 
-        served: with which they were identified; left out: the caller has looked in this transaction.  Raises
-        ModelChanged, before anything is stored, where the vehicle is followed with another model by now.
+        served, faults: with which they were identified; left out: the caller has looked in this transaction.  Raises
+        ModelChanged or FaultsChanged, before anything is stored, where the vehicle is followed with another model by
+        now, or its tracker knows of other faults.
 
         The vehicle is held until the transaction ends: whoever folds several uses `fold_all`.  The caller has called
         `partitions.prepare` before.
@@ -210,6 +234,10 @@ class Pipeline:
         at = self.hold_all(connection, [vehicle])[vehicle]
         if served is not None and served.model_id != at.served.model_id:
             raise ModelChanged(vehicle)
+        if faults is not None and any(estimate is not None for estimate in estimates):
+            now = at.served.engine.tracker.known_faults(at.state)
+            if now != faults:
+                raise FaultsChanged(now)
         # another process may have stored some of them while this one was identifying
         raced = known_windows(connection, vehicle, at.served.model_id, [w.start for w in windows])
         left = [(w, e) for w, e in zip(windows, estimates, strict=True) if w.start not in raced]

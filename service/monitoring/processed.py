@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from sprung.model.signals import Estimate, Window
+from sprung.model.signals import Estimate, MeasurementFault, Window
 from sprung.model.tracking.tracker import TrackerState
+from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.engines import ServedModel
 from sprung.service.monitoring.views import VehicleView
 from sprung.service.store.windows import WindowRecord
@@ -36,11 +37,21 @@ class IdentifiedBatch:
     known: dict[int, WindowRecord]  # those that are stored already, by start
     fresh: list[Window]
     estimates: list[Estimate | None]  # one per fresh window, None where dropped
+    faults: tuple[MeasurementFault, ...]  # of the vehicle's measurements, that were put right before
+    priority: Priority
     seconds: dict[str, float]  # by stage
 
 
 class ModelChanged(RuntimeError):
     """While windows were identified the vehicle was given another model."""
+
+
+class FaultsChanged(RuntimeError):
+    """While windows were identified the tracker has learned more of what is wrong with the vehicle's measurements."""
+
+    def __init__(self, faults: tuple[MeasurementFault, ...]) -> None:
+        super().__init__(f"now {len(faults)} are known")
+        self.faults = faults
 
 
 NO_EXCITATION = "no excitation: standstill, or too slow to tell anything"

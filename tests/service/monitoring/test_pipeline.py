@@ -95,6 +95,24 @@ def test_lasting_faults_of_a_vehicle_are_told_to_those_who_examine_its_windows(
     assert examiner.told == [()] * 9 + [examiner.faults]
 
 
+def test_windows_are_identified_anew_where_those_before_them_tell_of_other_faults(
+    engine: Engine, store: Store, compute: Compute, system: System
+) -> None:
+    """However far identifying is ahead of tracking, and also after a start: a replay always comes to the same."""
+    examiner = FakeExaminer(system)
+    pipeline = Pipeline(replace(engine, identifier=examiner), store, compute)
+    first = pipeline.identify("a", [make_window(system, i) for i in range(8)])
+    second = pipeline.identify("a", [make_window(system, i) for i in (8, 9)])
+    pipeline.keep(first)
+    batch = pipeline.keep(second)
+    assert [record.start for record in batch.records] == [START + 8 * HOP, START + 9 * HOP]
+    assert examiner.told == [()] * 10 + [examiner.faults] * 2
+    examiner.told.clear()
+    Pipeline(replace(engine, identifier=examiner), store, compute).process("a", [make_window(system, 10)])
+    assert examiner.told == [(), examiner.faults]
+    assert count(store, windows) == 11
+
+
 def test_dropped_windows_are_counted_and_are_uninformative(
     pipeline: Pipeline, store: Store, system: System, identifier: FakeIdentifier
 ) -> None:
