@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
+from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from sprung.service.rendering.render import STATIC, render
 
 router = APIRouter(include_in_schema=False)
+ICON = (STATIC / "icon.svg").read_bytes()  # as a file it would be answered in ranges, and errors in plain text
 
 
 @router.get("/docs")
@@ -26,9 +27,9 @@ async def openapi(request: Request) -> JSONResponse:
 
 
 @router.get("/favicon.ico")
-async def icon() -> FileResponse:
+async def icon() -> Response:
     """What browsers ask for by themselves: the pages' icon."""
-    return FileResponse(STATIC / "icon.svg", media_type="image/svg+xml")
+    return Response(ICON, media_type="image/svg+xml")
 
 
 def operations(schema: dict[str, Any]) -> list[dict[str, Any]]:

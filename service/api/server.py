@@ -98,7 +98,16 @@ class GuardedProtocol(H11Protocol):
             self.transport.write_eof()
 
     def send_400_response(self, msg: str) -> None:
-        """Answer malformed HTTP as problem+json, and close."""
+        """Answer malformed HTTP as problem+json, and close.
+
+        Where it is the body of a request that the application is at work on, what it answers goes nowhere.
+        """
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):  # it has begun to answer
+            self.transport.close()
+            return
         headers = [
             (b"content-type", b"application/problem+json"),
             (b"content-length", b"%d" % len(NO_HTTP_BODY)),

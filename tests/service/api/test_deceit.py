@@ -84,6 +84,24 @@ def test_what_is_no_http_is_answered_as_every_error(engine: Engine, tmp_path: Pa
     assert json.loads(body)["status"] == 400
 
 
+@pytest.mark.parametrize("more", [b"Content-Length: 5\r\n", b""], ids=["refused at once", "read to its end"])
+def test_a_body_that_goes_wrong_on_its_way_is_answered_once_and_logged_as_no_mistake_of_the_service(
+    engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture, more: bytes
+) -> None:
+    """Also when it comes in one piece with its head, before the application has begun to answer."""
+    head = b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+    with (
+        served(build_core(settings(tmp_path), engine)) as port,
+        socket.create_connection(("127.0.0.1", port), timeout=10) as line,
+    ):
+        line.sendall(head + more + b"Transfer-Encoding: chunked\r\n\r\n5\r\n{}   \r\n-1\r\n")
+        answer = b""
+        while piece := line.recv(65536):
+            answer += piece
+    assert answer.startswith(b"HTTP/1.1 400 ") and answer.count(b"HTTP/1.1 ") == 1
+    assert [record.message for record in caplog.records if record.exc_info or record.levelno >= logging.ERROR] == []
+
+
 def test_a_compressed_body_is_not_guessed_at(client: TestClient) -> None:
     headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
     answer = client.post("/identify", content=gzip.compress(b"0" * 1_000_000), headers=headers)

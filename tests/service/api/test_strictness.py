@@ -64,6 +64,7 @@ def test_a_page_goes_on_from_a_cursor_and_from_an_id(client: TestClient, broken:
 
 def test_browsers_find_an_icon(client: TestClient) -> None:
     answer = client.get("/favicon.ico")
+    assert client.get("/favicon.ico", headers={"Range": "bytes=999999-"}).content == answer.content
     assert answer.status_code == 200 and answer.headers["content-type"].startswith("image/svg+xml")
     assert client.get("/static/icon.svg?v=1").status_code == 200  # files keep a version in their address
 
