@@ -104,12 +104,21 @@ def _variants_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     return f"{table(task, rows)}\n\n{_made(rows)}\n\n{compared}"
 
 
+def _full_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    """Trained methods of every task with the full budget, which `folder` is then of."""
+    del task, folder
+    rows = [row | {"method": f"{row['task']} {name_of(row)}"} for row in rows if row.get("budget") == "full"]
+    rows = [row for row in rows if "settings" in row]
+    return f"{table('visual', rows)}\n\n{_made(rows)}" if rows else before.strip("\n")
+
+
 KINDS: dict[str, Callable[[str, Rows, Path, str], str]] = {
     "rows": _rows_place,
     "against": _against_place,
     "printed": _printed_place,
     "targets": _targets_place,
     "variants": _variants_place,
+    "full": _full_place,
 }
 
 
