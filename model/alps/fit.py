@@ -194,20 +194,26 @@ def train_method(
 
 
 def _update_loss(task: Task, model: VisualModel, data: Split, config: TrainingConfig, step: int, device: str) -> Tensor:
-    """The three-term loss on the windows of an update."""
+    """The three-term loss on the windows of an update.
+
+    What is to be drawn are the embeddings of the frame autoencoder as it was trained first, also where convolutions
+    are trained with the rest: against embeddings that learn, too, the loss is smallest when all of them are the same.
+    Pictures are drawn from simulated states as soon as these mean something; before, the decoder would learn to draw
+    the mean picture.
+    """
     phase, _ = config.phase(step)
+    warm_up = phase.trains in ("rates", "states")
     rows, starts = pick_windows(config, step, config.batch)
     inputs = windows(data.rollouts.inputs, starts, rows).to(device)
+    seen = embeddings = windows(data.embeddings, starts, rows).to(device)
     pictures = None
     if config.end_to_end:
         assert task.render is not None
         pictures = task.render(windows(data.rollouts.states, starts, rows).to(device).flatten(0, 1))
-        embeddings = model.frames.encode(pictures).unflatten(0, (config.batch, WINDOW))
-    else:
-        embeddings = windows(data.embeddings, starts, rows).to(device)
-    passed = model.network(embeddings, inputs, phase.horizon, warm_up=phase.trains in ("rates", "states"))
+        seen = model.frames.encode(pictures).unflatten(0, (config.batch, WINDOW))
+    passed = model.network(seen, inputs, phase.horizon, warm_up=warm_up)
     loss = loss_of(task, passed, embeddings, config, config.divergence(step)).total
-    if pictures is not None and passed.observed is not None:
+    if pictures is not None and passed.observed is not None and not warm_up:
         loss = loss + config.pixel_weight * picture_loss(model.frames.decode(passed.observed.flatten(0, 1)), pictures)
     return loss
 

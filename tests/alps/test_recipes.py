@@ -102,6 +102,23 @@ def test_convolutions_trained_end_to_end_are_the_methods_own_and_are_used_for_it
     assert fit.seen_by(model, task, data, TINY) is data
 
 
+def test_convolutions_that_see_nothing_are_no_way_to_a_small_loss() -> None:
+    task, frames = two_body.TASK, FrameAutoencoder(SIZES)
+    config = replace(
+        TINY, end_to_end=True, state_weight=0, pixel_weight=0, divergence_start=1e-9, divergence_weight=1e-9
+    )
+    data = split(task)
+    model = fit.new_model(task, "cdm", data, frames, config, SIZES)
+    assert model.network.decoder is not None
+    for module in (model.frames.embed.maps, model.network.decoder):
+        for weight in module.parameters():
+            torch.nn.init.zeros_(weight)  # every embedding the same, and that one drawn
+    with torch.no_grad():
+        model.network.decoder.affine.bias.copy_(fit.seen_by(model, task, data, config).embeddings[0, 0])
+        loss = fit._update_loss(task, model, data, config, 0, "cpu")
+    assert float(loss) > 0.1  # of data that have about unit spread
+
+
 def test_embeddings_from_a_file_train_to_the_same_bits(tmp_path: Path) -> None:
     task, frames = pendulum.TASK, FrameAutoencoder(SIZES)
     first = fit.embedded(task, TINY, frames, "train", tmp_path)
