@@ -20,7 +20,12 @@ from sprung.replay.inflate import LARGEST, PIECE
 SAMPLES_ALWAYS, SAMPLES_PER_BYTE = 10_000_000, 100  # that a file may give; well packed ones give about 5 a byte
 WHOLE_ALWAYS, WHOLE_RATIO = 1 << 28, 100  # bytes that a file which is read whole may unpack to, and times its size
 FOR_ITS_SIZE = "a file of its size can hold"
-COMPRESSED = 15  # miCOMPRESSED, a variable in zlib's format (MATLAB's "MAT-File Format", table 1-1)
+COMPRESSED, MATRIX = (
+    15,
+    14,
+)  # miCOMPRESSED, a variable in zlib's format, miMATRIX (MATLAB's "MAT-File Format", table 1-1)
+SMALL = 1 << 16  # a kind from this on has its size beside it, and its value in the tag
+DEEPEST_ARRAY = 500  # arrays inside each other; SciPy takes some thousands
 MAT_HEADER = 128
 MDF_BLOCKS = re.compile(rb"##(?:DZ|CG)\0{4}")
 MDF_ZIPPED = struct.Struct(
@@ -58,7 +63,11 @@ def check_whole(path: Path, sizes: Iterator[int]) -> None:
 
 
 def mat_sizes(path: Path) -> Iterator[int]:
-    """Bytes that the compressed variables of a MATLAB file (version 5) inflate to, piece by piece."""
+    """Bytes that the compressed variables of a MATLAB file (version 5) inflate to, piece by piece.
+
+    Raises UnreadableRecording for structures and cells so deep inside each other that SciPy runs out of stack, and the
+    process ends with it.
+    """
     with path.open("rb") as file:
         head = file.read(MAT_HEADER)
         order = {b"IM": "<", b"MI": ">"}.get(head[126:128])
@@ -66,10 +75,49 @@ def mat_sizes(path: Path) -> Iterator[int]:
             return
         while len(tag := file.read(8)) == 8:
             kind, size = struct.unpack(order + "II", tag)
+            nesting = _Nesting(path, order)
             if kind == COMPRESSED:
-                yield from _inflated(_pieces(file, size))
+                for piece in _inflated(_pieces(file, size)):
+                    nesting.feed(piece)
+                    yield len(piece)
             else:
-                file.seek(size, 1)
+                nesting.feed(tag)
+                for piece in _pieces(file, size):
+                    nesting.feed(piece)
+
+
+class _Nesting:
+    """Follows the elements of one variable of a MATLAB file."""
+
+    def __init__(self, path: Path, order: str) -> None:
+        """order: of bytes, as `struct` writes it."""
+        self._path = path
+        self._tag = struct.Struct(order + "II")
+        self._held = b""  # of a tag that has not come whole
+        self._left = 0  # bytes of an element that is not looked into
+        self._at = 0
+        self._ends: list[int] = []  # of the arrays that this place is inside of
+
+    def feed(self, piece: bytes) -> None:
+        """The next bytes."""
+        data, i = self._held + piece, 0
+        while True:
+            passed = min(self._left, len(data) - i)
+            i, self._left = i + passed, self._left - passed
+            if self._left or len(data) - i < self._tag.size:
+                break
+            at = self._at + i
+            while self._ends and at >= self._ends[-1]:
+                self._ends.pop()
+            kind, size = self._tag.unpack_from(data, i)
+            i += self._tag.size
+            if kind == MATRIX:
+                self._ends.append(at + self._tag.size + size)
+                if len(self._ends) > DEEPEST_ARRAY:
+                    raise UnreadableRecording(f"{self._path}: arrays lie more than {DEEPEST_ARRAY} deep in each other")
+            elif kind < SMALL:  # else its value stands in the tag
+                self._left = size + -size % 8
+        self._held, self._at = data[i:], self._at + i
 
 
 def mdf_sizes(path: Path) -> Iterator[int]:
@@ -89,7 +137,7 @@ def mdf_sizes(path: Path) -> Iterator[int]:
                 if links == 0 and length == MDF_ZIPPED.size + packed:
                     begin = at + MDF_ZIPPED.size
                     ends = range(begin, begin + packed, READ)
-                    yield from _inflated(data[a : min(a + READ, begin + packed)] for a in ends)
+                    yield from map(len, _inflated(data[a : min(a + READ, begin + packed)] for a in ends))
 
 
 def _pieces(file: BinaryIO, size: int) -> Iterator[bytes]:
@@ -98,14 +146,14 @@ def _pieces(file: BinaryIO, size: int) -> Iterator[bytes]:
         yield piece
 
 
-def _inflated(pieces: Iterable[bytes]) -> Iterator[int]:
-    """Sizes of what zlib data inflate to, until they end or are damaged."""
+def _inflated(pieces: Iterable[bytes]) -> Iterator[bytes]:
+    """What zlib data inflate to, until they end or are damaged."""
     inflater = zlib.decompressobj()
     try:
         for piece in pieces:
             left = piece
             while left and not inflater.eof:
-                yield len(inflater.decompress(left, PIECE))
+                yield inflater.decompress(left, PIECE)
                 left = inflater.unconsumed_tail
             if inflater.eof:
                 return

@@ -41,6 +41,37 @@ def test_a_table_of_a_billion_rows_that_were_never_written_is_refused(tmp_path: 
     assert "states 2000000000000 values" in refused(tmp_path / "a.h5")
 
 
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(("levels", "order"), [(100, "<"), (20_000, "<"), (20_000, ">")])
+def test_arrays_of_matlab_thousands_of_levels_inside_each_other_are_refused(
+    tmp_path: Path, levels: int, order: str, packed: bool
+) -> None:
+    """SciPy runs out of stack with them, and the process ends."""
+
+    def element(kind: int, value: bytes) -> bytes:
+        return struct.pack(f"{order}II", kind, len(value)) + value + bytes(-len(value) % 8)
+
+    def array(kind: int, rows: int) -> bytes:
+        name = struct.pack(f"{order}I4s", 2 << 16 | 1, b"ab\0\0")  # a small element: its size beside its kind
+        sizes = element(6, struct.pack(f"{order}II", kind, 0)) + element(5, struct.pack(f"{order}ii", rows, 1))
+        return sizes + name
+
+    inner = array(6, 100) + element(9, struct.pack(f"{order}100d", *range(100)))
+    heads, size = [element(14, inner)], len(inner) + 8
+    for _ in range(levels):
+        about = array(1, 1)
+        heads.append(struct.pack(f"{order}II", 14, len(about) + size) + about)
+        size += len(about) + 8
+    variable = b"".join(reversed(heads))
+    if packed:
+        small = zlib.compress(variable)
+        variable = struct.pack(f"{order}II", 15, len(small)) + small
+    mark = struct.pack(f"{order}HH", 0x0100, 0x4D49)
+    (tmp_path / "a.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + mark + variable)
+    said = "its columns: ab" if levels == 100 else "arrays lie more than 500 deep in each other"
+    assert refused(tmp_path / "a.mat").endswith(said)
+
+
 @pytest.mark.parametrize("branches", [1, 40])
 def test_groups_thousands_of_levels_inside_each_other_are_refused(tmp_path: Path, branches: int) -> None:
     h5py = pytest.importorskip("h5py")
