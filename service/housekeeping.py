@@ -14,13 +14,14 @@ from pathlib import Path
 from sqlalchemy import ColumnElement, Connection
 
 from sprung.service.settings import Settings
-from sprung.service.store import Store, retention, work
+from sprung.service.store import Store, outbox, retention, work
 from sprung.service.store.archive import open_archive
 from sprung.service.times import NANOSECONDS, now_ns
 
 log = logging.getLogger("sprung.housekeeping")
 PERIOD_SECONDS = 3600.0
 DAY = 86_400 * NANOSECONDS
+DELIVERIES_KEPT = 30 * DAY  # notifications that have arrived, or were given up
 LONGEST_PAUSE = DAY  # by which a pause of the service ages stored data
 
 
@@ -150,6 +151,8 @@ class Housekeeping:
 
         with self._store.write() as connection:
             forgotten = retention.forget(connection, limits, archived)
+            told = [row for *_, row in outbox.newest_of_sources(connection)]
+            outbox.forget_deliveries(connection, now - DELIVERIES_KEPT, told)
             if not keep:
                 connection.get_transaction().rollback()  # type: ignore[union-attr]
                 return forgotten

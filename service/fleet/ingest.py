@@ -94,7 +94,7 @@ class Ingest:
         now = self._clock()
         with self._pipeline.store.read() as connection:
             models = self._pipeline.engines.models_in_use(connection)
-            overdue = pending.overdue(connection, models, now - self._late)
+            overdue = pending.overdue(connection, models, now - self._late, now + AHEAD)
         count = 0
         for vehicle in overdue:
             with self._pipeline.store.write() as connection:
@@ -147,7 +147,7 @@ class Ingest:
             due = sorted((*held, *(w.start for w in fresh[:stepped_back] if w.start in came)))
             due += [w.start for w in fresh[stepped_back:] if w.start in came]
         else:
-            received = {start: held[start].received if start in held else now for start in (*held, *came)}
+            received = dict.fromkeys(came, now) | {start: _by(row.received, now) for start, row in held.items()}
             due = due_windows(received, last, self._hop, self._late, now)
         order = [came[start] if start in came else _restored(held[start]) for start in due]
         done = set(due) | known
@@ -241,6 +241,11 @@ def due_windows(received: dict[int, int], last: int, hop: float, late: int, now:
         due.append(start)
         last = max(last, start)
     return due
+
+
+def _by(received: int, now: int) -> int:
+    """When a window came; long ago, where that lies ahead: the clock has been set back, and nobody waits for it."""
+    return received if received <= now + AHEAD else 0
 
 
 def _restored(row: Waiting) -> WindowEstimate:

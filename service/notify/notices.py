@@ -28,10 +28,7 @@ from sprung.service.times import NANOSECONDS, now_ns
 log = logging.getLogger("sprung.notify")
 
 PAUSES = (5, 30, 120, 600, 1800, 3600, 10_800, 21_600, 43_200, 86_400)  # s before the next attempt
-KEPT_DAYS = 30
 PERIOD_SECONDS = 2.0
-FEED_KINDS = (events.FEED_LOST, events.FEED_FOUND)
-FORGET_SECONDS = 3600
 AT_ONCE = 50  # deliveries to one receiver before it is the next one's turn
 TURN_SECONDS = 2.0  # after which a receiver's turn ends with the attempt that is being made
 
@@ -78,7 +75,7 @@ class Notices:
         feeds = self._feeds()
         if any(feed.name not in self._working for feed in feeds):
             with self._store.read() as connection:
-                told = outbox.newest_of_sources(connection, FEED_KINDS)
+                told = outbox.newest_of_sources(connection)
             self._working = {name: kind == events.FEED_FOUND for name, kind, _ in told} | self._working
         for feed in feeds:
             if self._working.get(feed.name, True) != feed.works:
@@ -94,8 +91,10 @@ class Notices:
         Receivers take turns: one that takes ten seconds to fail holds the others up once, and not with everything that
         waits for it.
         """
+        ahead = now + 2 * PAUSES[-1] * NANOSECONDS
         with self._store.read() as connection:
-            waiting = {target: outbox.due(connection, now, target, AT_ONCE) for target in outbox.targets(connection)}
+            targets = outbox.targets(connection)
+            waiting = {target: outbox.due(connection, now, target, AT_ONCE, ahead) for target in targets}
         arrived = 0
         for rows in waiting.values():
             begun = time.monotonic()
@@ -130,16 +129,10 @@ class Notices:
             outbox.add_delivery(connection, row)
 
     def _run(self) -> None:
-        forgotten = 0
         while not self._stopping.wait(PERIOD_SECONDS):
             try:
                 self.watch_feeds()
                 self.deliver(now_ns())
-                if now_ns() - forgotten > FORGET_SECONDS * NANOSECONDS:
-                    forgotten = now_ns()
-                    with self._store.write() as connection:
-                        kept = [row for *_, row in outbox.newest_of_sources(connection, FEED_KINDS)]
-                        outbox.forget_deliveries(connection, forgotten - KEPT_DAYS * 86_400 * NANOSECONDS, kept)
             except Exception:  # the store, or no thread for a time-out: nothing else would send what waits
                 log.exception("notifications could not be sent; they are tried again")
 

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, and_, delete, func, insert, select, update
+from sqlalchemy import Connection, and_, delete, func, insert, or_, select, update
 
 from sprung.service.store.schema import deliveries
 
@@ -38,10 +38,15 @@ def targets(connection: Connection) -> list[str]:
     return list(connection.execute(query.order_by(deliveries.c.target)).scalars())
 
 
-def due(connection: Connection, now: int, target: str, limit: int) -> list[DeliveryRow]:
-    """Those of a receiver to be tried now, the longest waiting first."""
+def due(connection: Connection, now: int, target: str, limit: int, ahead: int) -> list[DeliveryRow]:
+    """Those of a receiver to be tried now, the longest waiting first.
+
+    ahead: ns, a time that no pause reaches: what is to wait until then was written down by a clock that has been set
+    back, and is tried now.
+    """
     table = deliveries
-    mine = (table.c.state == "waiting", table.c.target == target, table.c.next_ns <= now)
+    now_or_never = or_(table.c.next_ns <= now, table.c.next_ns > ahead)
+    mine = (table.c.state == "waiting", table.c.target == target, now_or_never)
     query = select(table).where(*mine).order_by(table.c.next_ns, table.c.created_ns)
     return [DeliveryRow(*row) for row in connection.execute(query.limit(limit))]
 
@@ -51,11 +56,11 @@ def settle(connection: Connection, delivery: str, now: int, **values: Any) -> No
     connection.execute(update(deliveries).where(deliveries.c.id == delivery).values(updated_ns=now, **values))
 
 
-def newest_of_sources(connection: Connection, kinds: Collection[str]) -> list[tuple[str, str, str]]:
-    """(source, kind, id) of the newest events of these kinds, by the source that they tell of."""
+def newest_of_sources(connection: Connection) -> list[tuple[str, str, str]]:
+    """(source, kind, id) of the newest events that tell of a source, of each."""
     source = deliveries.c.event["data"]["source"].as_string().label("source")
     query = select(deliveries.c.id, deliveries.c.kind, deliveries.c.created_ns, source)
-    told = query.where(deliveries.c.kind.in_(kinds)).subquery()
+    told = query.where(source.is_not(None)).subquery()
     last = select(told.c.source, func.max(told.c.created_ns).label("at")).group_by(told.c.source).subquery()
     newest = and_(told.c.source == last.c.source, told.c.created_ns == last.c.at)
     found = connection.execute(select(told.c.source, told.c.kind, told.c.id).join(last, newest))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, delete, select
+from sqlalchemy import Connection, delete, or_, select
 
 from sprung.service.store.engine import insert_or_ignore
 from sprung.service.store.schema import pending
@@ -49,11 +49,12 @@ def release(connection: Connection, vehicle: str, model_id: int, starts: Iterabl
         connection.execute(delete(pending).where(*mine, pending.c.start_ns.in_(chosen[first : first + 500])))
 
 
-def overdue(connection: Connection, model_ids: Sequence[int], before: int) -> list[str]:
-    """Vehicles of which something has waited since before a time, ns, in the order of their ids."""
+def overdue(connection: Connection, model_ids: Sequence[int], before: int, ahead: int) -> list[str]:
+    """Vehicles of which something has waited since before a time, ns, in the order of their ids; or since a time that
+    lies `ahead`: by a clock that has been set back."""
     query = (
         select(pending.c.vehicle_id)
-        .where(pending.c.model_id.in_(model_ids), pending.c.received_ns < before)
+        .where(pending.c.model_id.in_(model_ids), or_(pending.c.received_ns < before, pending.c.received_ns > ahead))
         .distinct()
         .order_by(pending.c.vehicle_id)
     )

@@ -90,6 +90,21 @@ def test_messages_sent_twice_and_in_any_order_come_to_the_same(
     assert ingest.sweep() == 0
 
 
+def test_windows_that_came_by_a_clock_that_was_set_back_do_not_wait_for_it(
+    engine: Engine, system: System, pipeline: Pipeline
+) -> None:
+    """Behind a gap they wait for seconds, not until the clock is there again."""
+    clock = Clock()
+    ingest = Ingest(pipeline, LATE, clock)
+    first, _, third, *_ = messages(engine, system, 15, 5)
+    ingest.take([first])
+    clock.now += 400 * 86_400 * NANOSECONDS
+    assert ingest.take([third])[0].waiting == 5
+    clock.now -= 400 * 86_400 * NANOSECONDS
+    assert ingest.sweep() == 5
+    assert ingest.sweep() == 0
+
+
 def test_many_vehicles_are_folded_with_the_statements_of_one(
     engine: Engine, system: System, pipeline: Pipeline, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
