@@ -156,6 +156,13 @@ class Pipeline:
             held = self._vehicles.get(vehicle)
         return () if held is None or held.served is not served else served.engine.tracker.known_faults(held.state)
 
+    def knows_faults(self, vehicle: str) -> bool:
+        """Whether the vehicle's tracker in memory knows of any: they change a little with every batch, so that windows
+        that are identified ahead would be identified anew."""
+        with self._lock:
+            held = self._vehicles.get(vehicle)
+        return held is not None and bool(self.known_faults(vehicle, held.served))
+
     def _identify(
         self,
         served: ServedModel,
