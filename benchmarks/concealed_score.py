@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from sprung.model.diagnosis.investigation.verdict import EffectKind
+from sprung.model.diagnosis.kinds import EffectKind
 
 Truth = Mapping[str, Any]
 Verdict = Mapping[str, Any]  # the JSON of a report

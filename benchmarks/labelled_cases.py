@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.diagnosis.investigation.verdict import EffectKind
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.system import MANCHESTER_DBC, System, load_system
 from sprung.replay.record import load_record

@@ -24,7 +24,7 @@ from scipy.signal import butter, chirp, sosfiltfilt
 
 from sprung.benchmarks.naming_rigs import RIGS, TRAVEL, RigKind
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
-from sprung.model.diagnosis.component.motion import element_motion
+from sprung.model.diagnosis.force.motion import element_motion
 from sprung.model.diagnosis.report.report import Finding
 from sprung.model.laws import ElementLaw, SpringDamper, find_law
 from sprung.model.laws.along import force_along

@@ -22,7 +22,7 @@ from sprung.benchmarks.generator.make import make_with_each_missing
 from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
 from sprung.benchmarks.structure import LIMIT, VISIBLE, MadeSamples, in_order
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.diagnosis.investigation.verdict import EffectKind
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.system import MANCHESTER, load_system
 

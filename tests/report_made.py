@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.verdict import EffectKind
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,

@@ -86,11 +86,13 @@ SERVICE_ORDER = (
 )
 STAGES = (
     "rules",
+    "kinds",
     "record",
     "response",
     "fit",
     "screening",
     "selection",
+    "force",
     "investigation",
     "report",
     "component",

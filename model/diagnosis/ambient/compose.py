@@ -9,7 +9,8 @@ import numpy as np
 from sprung.model.diagnosis.ambient.judgement import VARYING, AmbientJudgement, PooledValues
 from sprung.model.diagnosis.ambient.windows import WindowResult
 from sprung.model.diagnosis.investigation.state import Options, Recorded
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
+from sprung.model.diagnosis.investigation.verdict import kind_of
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.report.report import (
     Finding,

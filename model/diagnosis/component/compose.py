@@ -6,11 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sprung.model.diagnosis.component.deviations import covariance, spread
-from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.judgement import ComponentJudgement, JudgedComponent
-from sprung.model.diagnosis.component.piece import Lag
 from sprung.model.diagnosis.component.words import (
     finding_of,
     late_finding,
@@ -19,8 +16,11 @@ from sprung.model.diagnosis.component.words import (
     reversed_finding,
     unknown_finding,
 )
+from sprung.model.diagnosis.force.deviations import covariance, spread
+from sprung.model.diagnosis.force.fit import ComponentFit
+from sprung.model.diagnosis.force.piece import Lag
 from sprung.model.diagnosis.investigation.state import Options, Recorded
-from sprung.model.diagnosis.investigation.verdict import EffectKind
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,

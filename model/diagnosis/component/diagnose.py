@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.component.compose import compose_components
-from sprung.model.diagnosis.component.fit import fitted, refined
 from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.judgement import JudgedComponent, concluded
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
-from sprung.model.diagnosis.component.piece import HYSTERESIS, SURFACE, Piece
-from sprung.model.diagnosis.component.pieces import PIECES
-from sprung.model.diagnosis.component.search import Progress as PieceProgress
-from sprung.model.diagnosis.component.search import Ranked, Step, search
 from sprung.model.diagnosis.component.smooth import smooth_serves
+from sprung.model.diagnosis.force.fit import fitted, refined
+from sprung.model.diagnosis.force.piece import HYSTERESIS, SURFACE, Piece
+from sprung.model.diagnosis.force.pieces import PIECES
+from sprung.model.diagnosis.force.search import Progress as PieceProgress
+from sprung.model.diagnosis.force.search import Ranked, Step, search
 from sprung.model.diagnosis.investigation.state import Options, Progress, Recorded
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.diagnosis.rules import ComponentRules, VerdictRules

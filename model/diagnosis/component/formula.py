@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.diagnosis.component.deviations import covariance, spread
-from sprung.model.diagnosis.component.fit import ComponentModel, ComponentTask, refined
-from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, MotionSizes, Piece, Shape
-from sprung.model.diagnosis.component.search import Ranked, Search, Step, next_laws
+from sprung.model.diagnosis.force.deviations import covariance, spread
+from sprung.model.diagnosis.force.fit import ComponentModel, ComponentTask, refined
+from sprung.model.diagnosis.force.piece import HYSTERESIS, STATIC, MotionSizes, Piece, Shape
+from sprung.model.diagnosis.force.search import Ranked, Search, Step, next_laws
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance
 from sprung.model.laws import ElementLaw, Motion, Observed, SpringDamper

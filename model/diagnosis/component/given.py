@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.component.deviations import spread
-from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel
 from sprung.model.diagnosis.component.formula import given_piece
 from sprung.model.diagnosis.component.own import own_piece
-from sprung.model.diagnosis.component.piece import Piece
-from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.force.deviations import spread
+from sprung.model.diagnosis.force.fit import ComponentFit, ComponentModel
+from sprung.model.diagnosis.force.piece import Piece
+from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
 from sprung.model.laws import ElementLaw, Observed
 from sprung.model.laws.gas import PRELOAD

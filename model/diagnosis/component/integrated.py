@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from sprung.model.diagnosis.component.motion import without_gaps
+from sprung.model.diagnosis.force.motion import without_gaps
 from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray

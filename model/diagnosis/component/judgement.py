@@ -9,12 +9,13 @@ from functools import cached_property
 import numpy as np
 
 from sprung.model.diagnosis.component.alike import EquivalentModel, look_alikes
-from sprung.model.diagnosis.component.deviations import covariance, left_open
-from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.measured import ComponentRecord
-from sprung.model.diagnosis.component.search import Search, Step
+from sprung.model.diagnosis.force.deviations import covariance, left_open
+from sprung.model.diagnosis.force.fit import ComponentFit
+from sprung.model.diagnosis.force.search import Search, Step
 from sprung.model.diagnosis.investigation.setup_effects import SIGN_REVERSED
-from sprung.model.diagnosis.investigation.verdict import EffectKind, HeldOutErrors, Verdict, kind_of, verdict_of
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.rules import Rules
 from sprung.model.signals import FloatArray
 

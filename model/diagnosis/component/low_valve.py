@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit, fitted
-from sprung.model.diagnosis.component.piece import Piece
-from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.force.fit import ComponentFit, fitted
+from sprung.model.diagnosis.force.piece import Piece
+from sprung.model.diagnosis.force.pieces import PIECES
 
 _KNEES = (0.9, 1.1, 1.3, 1.5, 1.7, 1.9, 2.2)  # over the rate at which tanh turns: it levels off at 1.5
 

@@ -11,17 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentModel, ComponentTask, NominalValues
 from sprung.model.diagnosis.component.given import given_model
 from sprung.model.diagnosis.component.integrated import integrated, without_slow
-from sprung.model.diagnosis.component.motion import (
+from sprung.model.diagnosis.component.own import observed, own_pieces
+from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentModel, ComponentTask, NominalValues
+from sprung.model.diagnosis.force.motion import (
     element_motion,
     noise_at_rest,
     still_stretches,
     without_gaps,
 )
-from sprung.model.diagnosis.component.own import observed, own_pieces
-from sprung.model.diagnosis.component.piece import Piece
+from sprung.model.diagnosis.force.piece import Piece
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
 from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.diagnosis.rules import RULES, Rules

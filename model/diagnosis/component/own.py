@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, FittedPiece, MotionSizes, Piece, Shape
+from sprung.model.diagnosis.force.motion import ElementMotion
+from sprung.model.diagnosis.force.piece import HYSTERESIS, STATIC, FittedPiece, MotionSizes, Piece, Shape
 from sprung.model.laws import ElementLaw, Law, Observed, SpringDamper, observe
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray

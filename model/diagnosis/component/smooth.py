@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit, refined
-from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.piece import ELASTIC, MotionSizes, Piece, Shape, SliderSurface
+from sprung.model.diagnosis.force.fit import ComponentFit, refined
+from sprung.model.diagnosis.force.motion import ElementMotion
+from sprung.model.diagnosis.force.piece import ELASTIC, MotionSizes, Piece, Shape, SliderSurface
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray
 

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.formula import FormulaPiece
-from sprung.model.diagnosis.component.piece import Values
-from sprung.model.diagnosis.component.search import Step
+from sprung.model.diagnosis.force.fit import ComponentFit
+from sprung.model.diagnosis.force.piece import Values
+from sprung.model.diagnosis.force.search import Step
 from sprung.model.diagnosis.investigation.setup_effects import SIGN_REVERSED
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
+from sprung.model.diagnosis.investigation.verdict import kind_of
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.selection.evidence import bic
 from sprung.model.laws.basis import UNKNOWN

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.along_motion import with_laws_along_motion
 from sprung.model.diagnosis.investigation.common_delay import common_delay
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
@@ -69,6 +71,7 @@ def with_findings(state: Investigation, progress: Progress) -> Investigation:
     """Findings until the residual is noise."""
     # the residual of an estimated delay, scale or position is not searched for unmodelled dynamics
     uncertain, notes = any(fault.value is not None for fault in state.setup_faults), state.notes
+    state = (None if uncertain else with_laws_along_motion(state, progress)) or state
     for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
         before = state
         state = next_finding(state, number, progress)
@@ -103,6 +106,9 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     """The model on the whole recording, its errors on the held-out part, and the verdict."""
     work = state.problem.work
     ended = work.limit if work is not None and work.ended else ""  # the conclusion has no limit of work
+    if ended:  # values and noise levels of the last finding may not have been fitted to the end
+        problem, fit = refreshed(replace(state.problem, work=None), state.fit)
+        state = replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise))
     state = without_insignificant(state)
     progress(0.93, "the model on the whole recording")
     final = _on_whole_recording(state)

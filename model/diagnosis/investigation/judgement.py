@@ -11,14 +11,8 @@ from sprung.model.diagnosis.investigation.calibration import faulty, within_tole
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
 from sprung.model.diagnosis.investigation.setup_effects import WRONG_BODY
 from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
-from sprung.model.diagnosis.investigation.verdict import (
-    EffectKind,
-    HeldOutErrors,
-    Verdict,
-    bounded_noise,
-    kind_of,
-    verdict_of,
-)
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, bounded_noise, kind_of, verdict_of
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, VerdictRules

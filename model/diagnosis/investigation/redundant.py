@@ -35,7 +35,7 @@ def without_redundant(state: Investigation) -> Investigation:
 
 def without(state: Investigation, index: int) -> Investigation | None:
     """The investigation without one of its findings, everything else fitted again; None where that diverges."""
-    fit, problem = _without(state, state.given + index), state.problem
+    fit, problem = fit_without(state, state.given + index), state.problem
     if fit is None:
         return None
     if problem.process_noise:  # the force noise takes its place
@@ -55,7 +55,7 @@ def _gain(other: Investigation, state: Investigation) -> float:
     return profile_gain(before.residual, after.residual, sensors, rules.quiet, rules)
 
 
-def _without(state: Investigation, index: int) -> Fit | None:
+def fit_without(state: Investigation, index: int) -> Fit | None:
     """The model without one of its terms, fitted again with the same weights; None where that diverges."""
     point, forces = state.fit.point, list(state.fit.point.warm_start)
     warm = [forces.pop(0) if evaluated_in_time(term) and forces else None for term in point.terms]

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 from typing import Literal
 
 import numpy as np
 
 from sprung.model.diagnosis.investigation.setup_effects import SetupEffect
+from sprung.model.diagnosis.kinds import EffectKind, kind_of_law
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.laws import Law
 from sprung.model.signals import FloatArray
@@ -26,22 +26,9 @@ from sprung.model.signals import FloatArray
 Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
 
 
-class EffectKind(Enum):
-    """The kind of a finding, as reports name it."""
-
-    LISTED = "law"  # physics of a listed law
-    UNLISTED = "unlisted"  # physics that no law explains: a surface, a formula
-    FAULT = "measurement"  # a fault of a sensor, an input or the set-up
-    NUISANCE = "nuisance"  # reported, and no reason for any verdict
-
-
 def kind_of(effect: Law | SetupEffect) -> EffectKind:
     """The kind of a law or of a set-up fault."""
-    if isinstance(effect, SetupEffect) or effect.fault:
-        return EffectKind.FAULT
-    if effect.nuisance:
-        return EffectKind.NUISANCE
-    return EffectKind.LISTED if effect.listed else EffectKind.UNLISTED
+    return EffectKind.FAULT if isinstance(effect, SetupEffect) else kind_of_law(effect)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ import numpy as np
 from sprung.model.diagnosis.investigation.calibration import faulty, within_tolerance
 from sprung.model.diagnosis.investigation.setup_fitted import SetupFault
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, InputFault, NoiseFault, Outcome
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
+from sprung.model.diagnosis.investigation.verdict import kind_of
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of
 from sprung.model.diagnosis.report.values import formula_of, input_fault_parameter, law_parameters

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sprung.model.diagnosis.investigation.verdict import EffectKind, Verdict
+from sprung.model.diagnosis.investigation.verdict import Verdict
+from sprung.model.diagnosis.kinds import EffectKind
 
 
 @dataclass(frozen=True, slots=True)

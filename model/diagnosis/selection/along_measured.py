@@ -14,11 +14,13 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import refreshed, with_force_noise
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.starts import joint_start, seen, wider_starts
 from sprung.model.schema import ForceInput
+from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 _STEPS, _ROUNDS = 8, 5  # of a fit along the measured motion, and how often it goes on
@@ -26,6 +28,16 @@ SHARPENED = 20  # steps of a simulation, in which a blunt corner becomes sharp
 _BLUNT, _LESS_BLUNT = 0.25, 0.1  # of the rms rate, widths of corners from which a simulation's fit sharpens them
 _SHARP = 0.01  # the same along the measured motion, which corners do not change
 _PER_MASS = 1.0  # m/s^2, first level of the unmeasured forces over the masses they act on
+
+
+@dataclass(frozen=True)
+class ForceAlongMotion:
+    """What an element has to carry along a motion, evenly sampled."""
+
+    time: FloatArray  # s since the start of the recording, (T,)
+    deflection: FloatArray  # m, (T,)
+    rate: FloatArray  # m/s, (T,)
+    force: FloatArray  # N, without that of the system file's laws, (T,)
 
 
 @dataclass(frozen=True)
@@ -58,6 +70,30 @@ class MeasuredMotion:
             return None
         fit = try_optimise(along, start, _STEPS)
         return None if fit is None else cls(along, fit)
+
+    def force_of(self, element: str) -> ForceAlongMotion:
+        """The force of an element: of its spring and damper, and the unmeasured one of the body that tells it best.
+
+        That is the body with the fewest other elements, whose errors it contains too; of two such, the mean.
+        """
+        system, fit, thin = self.problem.system, self.fit, slice(None, None, OVERSAMPLING)
+        part, grid = fit.forward.part, fit.forward.part.grid
+        bodies, elements = list(system.bodies), system.file.elements
+        ends = {
+            end: sign
+            for end, sign in ((elements[element].upper, -1.0), (elements[element].lower, 1.0))
+            if end in bodies
+        }
+        others = {body: sum(body in (one.upper, one.lower) for one in elements.values()) for body in ends}
+        near = [body for body in ends if others[body] == min(others.values())]
+        unmeasured = grid.fine(part.force) + grid.fine_monomials @ part.force_polynomial
+        columns = {body: len(part.force[0]) - len(bodies) + bodies.index(body) for body in near}
+        missing = np.mean([ends[body] * unmeasured[:, columns[body]] for body in near], axis=0)
+        port = np.eye(len(system.elements))[system.elements.index(element)]
+        d, v = (motion @ port for motion in fit.element_motion)
+        own = fit.forward.element_at(element)
+        force = float(own.stiffness) * d + float(own.damping) * v + missing
+        return ForceAlongMotion((grid.start + grid.fine_time)[thin], d[thin], v[thin], force[thin])
 
     def wider(self, index: int) -> Point | None:
         """The present model with one of its laws in the wider form, fitted along the measured motion; None: no form."""

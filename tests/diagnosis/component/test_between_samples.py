@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.component.deviations import covariance, left_open
-from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentTask, fitted, refined
-from sprung.model.diagnosis.component.motion import element_motion
-from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.force.deviations import covariance, left_open
+from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentTask, fitted, refined
+from sprung.model.diagnosis.force.motion import element_motion
+from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.laws.paths import presliding_path
 
 REACH, FORCE = 4e-4, 150.0

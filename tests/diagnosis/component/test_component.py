@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import butter, sosfiltfilt
 
 from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
-from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches
+from sprung.model.diagnosis.force.motion import element_motion, noise_at_rest, still_stretches
 from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.laws import CATALOGUE, Law
 from sprung.model.laws.paths import maxwell_path, presliding_path, stop_path

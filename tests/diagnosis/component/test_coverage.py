@@ -7,10 +7,10 @@ import pytest
 
 from sprung.benchmarks import naming
 from sprung.benchmarks.naming_rigs import RIGS
-from sprung.model.diagnosis.component.deviations import covariance, left_open, spread
-from sprung.model.diagnosis.component.fit import ComponentModel, refined
 from sprung.model.diagnosis.component.measured import component_records
-from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.force.deviations import covariance, left_open, spread
+from sprung.model.diagnosis.force.fit import ComponentModel, refined
+from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.rules import RULES
 
 LUGRE = next(piece for piece in PIECES if piece.effect == "lugre")

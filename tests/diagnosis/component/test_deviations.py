@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.component.deviations import covariance, left_open, moved_in_common
-from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentFit, ComponentTask, refined
 from sprung.model.diagnosis.component.low_valve import low_valve
-from sprung.model.diagnosis.component.motion import element_motion
-from sprung.model.diagnosis.component.piece import Piece
-from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.force.deviations import covariance, left_open, moved_in_common
+from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentFit, ComponentTask, refined
+from sprung.model.diagnosis.force.motion import element_motion
+from sprung.model.diagnosis.force.piece import Piece
+from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.signals import FloatArray
 
 RATE, K, C = 100.0, 2e4, 900.0

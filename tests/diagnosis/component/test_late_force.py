@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt, sosfiltfilt
 
-from sprung.model.diagnosis.component.motion import element_motion
+from sprung.model.diagnosis.force.motion import element_motion
 from tests.diagnosis.component.test_component import RATE, C, K, laws, report
 
 SHIFT = 4  # of the finer samples

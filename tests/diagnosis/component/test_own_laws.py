@@ -9,7 +9,7 @@ import pytest
 
 from sprung.model.diagnosis.api import diagnose
 from sprung.model.diagnosis.component.diagnose import pieces_of
-from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.laws import CATALOGUE, ElementLaw, ParameterSpec, grid
 from sprung.model.system import parse_system
 from tests.diagnosis.component.test_component import TEXT, C, K, RigRecording, report, sweep

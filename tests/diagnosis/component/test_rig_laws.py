@@ -9,11 +9,11 @@ from scipy.signal import butter, chirp, sosfiltfilt
 
 from sprung.benchmarks.real_reference import bouc_wen
 from sprung.model.diagnosis.api import Report, diagnose
-from sprung.model.diagnosis.component.fit import ComponentTask
-from sprung.model.diagnosis.component.motion import element_motion
-from sprung.model.diagnosis.component.piece import FittedPiece
-from sprung.model.diagnosis.component.pieces import PIECES
-from sprung.model.diagnosis.component.search import search
+from sprung.model.diagnosis.force.fit import ComponentTask
+from sprung.model.diagnosis.force.motion import element_motion
+from sprung.model.diagnosis.force.piece import FittedPiece
+from sprung.model.diagnosis.force.pieces import PIECES
+from sprung.model.diagnosis.force.search import search
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.laws import SpringDamper
 from sprung.model.system import parse_system

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.component.fit import NO_LAWS, refined
 from sprung.model.diagnosis.component.smooth import smooth_serves
+from sprung.model.diagnosis.force.fit import NO_LAWS, refined
 from sprung.model.signals import FloatArray
 from tests.diagnosis.component.test_deviations import D, V, piece, task
 

@@ -24,7 +24,8 @@ from sprung.model.diagnosis.investigation.setup_effects import (
 from sprung.model.diagnosis.investigation.setup_fitted import SetupFault
 from sprung.model.diagnosis.investigation.setup_response import Group
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
+from sprung.model.diagnosis.investigation.verdict import kind_of
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.report.compose import places_put_right

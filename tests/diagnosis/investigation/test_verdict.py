@@ -7,13 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.investigation.verdict import (
-    EffectKind,
-    HeldOutErrors,
-    bounded_noise,
-    kind_of,
-    verdict_of,
-)
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise, kind_of, verdict_of
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.hysteresis import BOUC_WEN

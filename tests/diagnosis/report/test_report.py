@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.verdict import EffectKind
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Finding, FitFigures, IdentifiedLaw, LawParameter, plain
 
 

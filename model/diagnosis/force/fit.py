@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
-from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.piece import Lag, MotionSizes, Part, Values
+from sprung.model.diagnosis.force.motion import ElementMotion
+from sprung.model.diagnosis.force.piece import Lag, MotionSizes, Part, Values
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.along import force_along

@@ -20,8 +20,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, refined
-from sprung.model.diagnosis.component.piece import LAGS, SURFACE, Lag
+from sprung.model.diagnosis.force.fit import ComponentFit, ComponentModel, refined
+from sprung.model.diagnosis.force.piece import LAGS, SURFACE, Lag
 from sprung.model.laws import SpringDamper
 from sprung.model.signals import FloatArray
 

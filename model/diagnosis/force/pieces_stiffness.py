@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.component.piece import (
+from sprung.model.diagnosis.force.piece import (
     ELASTIC,
     FittedPiece,
     Piece,

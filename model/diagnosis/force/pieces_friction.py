@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sprung.model.diagnosis.component.piece import (
+from sprung.model.diagnosis.force.piece import (
     FRICTION,
     HYSTERESIS,
     FittedPiece,

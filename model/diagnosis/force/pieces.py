@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.component.piece import Piece
-from sprung.model.diagnosis.component.pieces_damping import DAMPING_PIECES
-from sprung.model.diagnosis.component.pieces_friction import FRICTION_PIECES
-from sprung.model.diagnosis.component.pieces_stiffness import STIFFNESS_PIECES
+from sprung.model.diagnosis.force.piece import Piece
+from sprung.model.diagnosis.force.pieces_damping import DAMPING_PIECES
+from sprung.model.diagnosis.force.pieces_friction import FRICTION_PIECES
+from sprung.model.diagnosis.force.pieces_stiffness import STIFFNESS_PIECES
 from sprung.model.laws import ElementLaw, grid
 from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
 

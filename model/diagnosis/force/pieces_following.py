@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from sprung.model.diagnosis.component.piece import Following, LawPiece, Piece, no_shapes
-from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.force.piece import Following, LawPiece, Piece, no_shapes
+from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.laws.following import Covariate, following_law
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
+from sprung.model.diagnosis.force.motion import ElementMotion
+from sprung.model.diagnosis.kinds import EffectKind, kind_of_law
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import CLOCK_LEAD, ElementLaw, SpringDamper, reversal_step
 from sprung.model.laws.along import force_along
@@ -129,7 +129,7 @@ class Piece:
     @property
     def effect_kind(self) -> EffectKind:
         """The kind of finding that it is."""
-        return kind_of(self.law)
+        return kind_of_law(self.law)
 
     @property
     def title(self) -> str:

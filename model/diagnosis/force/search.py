@@ -13,8 +13,8 @@ from itertools import islice
 
 import numpy as np
 
-from sprung.model.diagnosis.component.deviations import covariance, left_open, spread
-from sprung.model.diagnosis.component.fit import (
+from sprung.model.diagnosis.force.deviations import covariance, left_open, spread
+from sprung.model.diagnosis.force.fit import (
     NO_LAWS,
     ComponentFit,
     ComponentModel,
@@ -23,9 +23,9 @@ from sprung.model.diagnosis.component.fit import (
     fitted,
     refined,
 )
-from sprung.model.diagnosis.component.piece import LAGS, FittedPiece, Following, Lag, LawPiece, Part
-from sprung.model.diagnosis.component.pieces import PIECES
-from sprung.model.diagnosis.component.pieces_following import pieces_following
+from sprung.model.diagnosis.force.piece import LAGS, FittedPiece, Following, Lag, LawPiece, Part
+from sprung.model.diagnosis.force.pieces import PIECES
+from sprung.model.diagnosis.force.pieces_following import pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
 
@@ -93,14 +93,15 @@ def search(
     pieces: tuple[LawPiece, ...] = PIECES,
     progress: Progress = lambda text: None,
     given: ComponentModel = NO_LAWS,
+    lags: tuple[Lag, ...] = LAGS,
 ) -> Search:
     """Add laws until the residual is noise, or no law explains enough of it.
 
-    given: laws of the system file, to which others are added.
+    given: laws of the system file, to which others are added.  lags: of a measured force behind the motion.
     """
     rules = task.rules
     tests = rules.trials_of_a_law * len(pieces)
-    pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)), *LAGS)
+    pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)), *lags)
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
     base = refined(quick, given)

@@ -1,0 +1,276 @@
+"""All laws of one element together, from its force along the measured motion.
+
+Beside a model that lacks several laws of an element, each of them is sought along a motion that the others would
+change: a search one by one is slow there, and takes values on that the others keep it from leaving.  With an unmeasured
+force on every body the smoothed motion is the measured one, and what the element's model lacks is a known force along
+it.  Its laws are found by regressions (`force.search`) and then simulated together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.baseline import refreshed, settled
+from sprung.model.diagnosis.fit.misfit import is_gross
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.force.fit import ComponentFit, ComponentTask, NominalValues
+from sprung.model.diagnosis.force.motion import ElementMotion
+from sprung.model.diagnosis.force.piece import Piece
+from sprung.model.diagnosis.force.pieces import PIECES
+from sprung.model.diagnosis.force.search import search
+from sprung.model.diagnosis.investigation.judgement import leaves_more_than_noise
+from sprung.model.diagnosis.investigation.redundant import fit_without
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress, share_done
+from sprung.model.diagnosis.investigation.widened import with_model
+from sprung.model.diagnosis.record.white_noise import white_noise
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import WIDER, Term, evaluated_in_time
+from sprung.model.diagnosis.screening.families import ELEMENT
+from sprung.model.diagnosis.screening.score import Candidate
+from sprung.model.diagnosis.selection.along_measured import ForceAlongMotion, MeasuredMotion
+from sprung.model.diagnosis.selection.compete import Trial, cost, noise_bound
+from sprung.model.diagnosis.selection.evidence import chance, profile_gain
+from sprung.model.diagnosis.selection.plausible import doubt, hardly_there
+from sprung.model.laws import ElementLaw, Law, SpringDamper, observe
+from sprung.model.laws.along import force_along
+from sprung.model.system import System
+
+_STEPS, _ROUNDS = 12, 3  # of the simulation of all laws, and how often it goes on
+_LEAST = 1e-3  # of nominal, of a spring or damper that a force seems not to have
+_TURNED = 2  # of the same model with its laws in another order
+
+
+@dataclass(frozen=True)
+class _Laws:
+    """Several laws of one element, simulated together."""
+
+    without: str  # name of the law that was left out of their search; empty: none
+    fit: Fit
+    evidence: float  # over the model without them
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(term.law.name for term in self.fit.point.terms)
+
+
+def with_laws_along_motion(state: Investigation, progress: Progress) -> Investigation | None:
+    """The investigation with several laws of one element as findings, if these leave nothing but noise; else None.
+
+    Only where the model is far from the recording, and before anything was found.
+    """
+    place = _place(state)
+    if state.found or place is None or not is_gross(state.problem, state.fit):
+        return None
+    progress(share_done(0), f"the force of {place} along the measured motion")
+    sets = _sets_of_laws(state, place)
+    best = max(sets, key=lambda one: one.evidence, default=None)
+    found = None if best is None else _findings(state, best, sets)
+    if best is None or found is None:
+        return None
+    other = replace(with_model(state, best.fit), found=found)
+    other = replace(other, fit=settled(other.problem, other.fit))
+    refuted = state.options.held_out and not state.held.still and state.held.compare(state.fit, other.fit).refuted
+    noise = other.fit.reduced <= noise_bound(other.problem, other.fit) and not leaves_more_than_noise(other)
+    return other if noise and not refuted else None
+
+
+def _place(state: Investigation) -> str | None:
+    """The element with the most suspicious law in time; None where a part or a body is more suspicious."""
+    rules = state.options.rules.screening
+    here = [one for one in state.last.candidates if one.score > 0]
+    best = max(here, key=lambda one: one.strength(rules), default=None)
+    return best.location if best is not None and best.location in state.system.elements else None
+
+
+def _sets_of_laws(state: Investigation, place: str) -> list[_Laws]:
+    """Sets of plausible laws of an element, as simulated: the likeliest, and likely ones without one of it.
+
+    None where a single law makes the force: it competes with those of other places (`next_finding`).
+
+    Regressions prefer one set to another by little where the smoothed motion is not exactly the measured one, and the
+    simulations of both by far.
+    """
+    measured = MeasuredMotion.of(state.problem, state.fit)
+    if measured is None:
+        return []
+    along = MeasuredMotion(*refreshed(measured.problem, measured.fit))
+    force, pieces = along.force_of(place), _pieces(state.problem.system)
+    task = _task(state, place, force, along.fit)
+    first = search(task, pieces, lags=())
+    names = list(dict.fromkeys(piece.effect for piece in first.final.model.pieces))
+    if len(names) < 2:
+        return []
+    others = [(name, search(task, tuple(p for p in pieces if p.effect != name), lags=())) for name in names]
+    near = state.options.rules.selection.alike * first.final.error
+    fits = {
+        name: _simulated(state, _start(state, place, found.final, force, along.fit))
+        for name, found in (("", first), *others)
+        if len(found.steps) > 1 and found.final.error <= near
+    }
+    believed = {name: fit for name, fit in fits.items() if fit is not None and _is_believed(state, fit)}
+    quietest = min((fit.reduced for fit in believed.values()), default=1.0)
+    return [_Laws(name, fit, _evidence(state, fit, quietest)) for name, fit in believed.items()]
+
+
+def _evidence(state: Investigation, fit: Fit, quietest: float) -> float:
+    """Evidence of a model with several laws over the one without; quietest: the least reduced chi-square of several."""
+    rules, sensors = state.options.rules.evidence, len(state.problem.sensors)
+    gain = profile_gain(state.fit.residual, fit.residual, sensors, rules.quiet * min(quietest, 1.0), rules)
+    return gain - sum(cost(fit, rules, index) for index in range(state.given, len(fit.point.terms)))
+
+
+def _task(state: Investigation, place: str, force: ForceAlongMotion, along: Fit) -> ComponentTask:
+    """The force of an element along a motion, as that of a component test."""
+    rules = state.options.rules
+    return ComponentTask(
+        motion=ElementMotion.of(force.time, force.deflection, force.rate, 0.0, 0.0),
+        force=force.force,
+        split=int(rules.record.fitted * len(force.force)),
+        nominal=_held(state.problem.system, place, along),
+        rules=rules.component,
+        noise=white_noise(force.force, rules.white_noise),
+    )
+
+
+def _start(state: Investigation, place: str, found: ComponentFit, force: ForceAlongMotion, along: Fit) -> Point:
+    """The model with the laws, spring and damper that were found in a force."""
+    theta = along.point.theta.copy()
+    for index, parameter in enumerate(state.problem.system.parameters):
+        if parameter.element == place:
+            value = max(float(getattr(found.element, parameter.quantity)), _LEAST * parameter.nominal)
+            theta[index] = np.log(value / parameter.nominal)
+    terms = (*along.point.terms, *_terms(found, place, force))
+    return _started(state, Point(theta, terms, np.zeros_like(state.fit.point.state)), along)
+
+
+def _held(system: System, place: str, fit: Fit) -> NominalValues:
+    """Spring and damper of an element that are not estimated."""
+    free = {parameter.quantity for parameter in system.parameters if parameter.element == place}
+    element = fit.forward.element_at(place)
+    k, c = (None if q in free else float(getattr(element, q)) for q in ("stiffness", "damping"))
+    return NominalValues(k, c)
+
+
+def _pieces(system: System) -> tuple[Piece, ...]:
+    """Pieces of the laws that are sought in systems of bodies, in time."""
+    sought = [
+        law for law in system.catalogue if isinstance(law, ElementLaw) and law.screened and law.where == "element"
+    ]
+    known: list[Law] = [*sought, *(law.wider for law in sought if law.wider is not None)]
+    return tuple(p for p in PIECES if p.acting is None and p.law.in_time and not p.law.nuisance and p.law in known)
+
+
+def _terms(fit: ComponentFit, place: str, along: ForceAlongMotion) -> Iterator[Term]:
+    """Terms of the laws of a fit."""
+    element = fit.element
+    seen = observe(along.deflection, along.rate, 1 / fit.task.motion.step, element.stiffness, element.damping)
+    for index, piece in enumerate(fit.model.pieces):
+        if not isinstance(piece, Piece):
+            continue
+        law = piece.law
+        values = law.clip([value for value, _ in fit.values(index).values()])
+        scales = tuple(max(abs(spec.typical(seen)), 1e-12) for spec in law.parameters)
+        yield Term(law, place, tuple(values.tolist()), "" if law.screened else WIDER, scales=scales)
+
+
+def _started(state: Investigation, point: Point, along: Fit) -> Point:
+    """A point with the forces of its laws along a motion as the start of their simulation."""
+    grid = along.forward.part.grid
+    time, forces = grid.start + grid.fine_time, []
+    elements = state.problem.forward(replace(point, terms=along.point.terms))
+    for term in point.terms:
+        if evaluated_in_time(term):
+            d, v = (motion @ term.port(state.problem.system) for motion in along.element_motion)
+            element = SpringDamper(*(float(value) for value in elements.element_of(term)))
+            forces.append(force_along(term.element_law, term.parameters, d, v, time, element))
+    return replace(point, warm_start=tuple(forces))
+
+
+def _simulated(state: Investigation, start: Point) -> Fit | None:
+    """The fit of all laws to the recording; None where it diverges."""
+    whitener = state.fit.whitener
+    fit = try_optimise(state.problem, start, _STEPS, whitener)
+    for _ in range(_ROUNDS):
+        if fit is None or fit.converged:
+            break
+        on = try_optimise(state.problem, fit.point, _STEPS, whitener)
+        if on is None or on.chi_square >= fit.chi_square:
+            break
+        fit = on
+    return fit
+
+
+def _is_believed(state: Investigation, fit: Fit) -> bool:
+    """Whether all laws have plausible values and are there."""
+    rules = state.options.rules.plausible
+    new = range(state.given, len(fit.point.terms))
+    return all(doubt(fit, fit.point.terms[i], rules) is None and not hardly_there(fit, rules, i) for i in new)
+
+
+def _findings(state: Investigation, best: _Laws, sets: list[_Laws]) -> tuple[AcceptedFinding, ...] | None:
+    """Every law as a finding, by what the model without it leaves; None if one may be chance."""
+    whole = replace(state, fit=best.fit)
+    tests = state.last.tried(ELEMENT) if state.options.multiplicity else 1
+    found = []
+    for index in range(state.given, len(best.fit.point.terms)):
+        trial = _trial(whole, index)
+        if trial is None or trial.evidence <= 0:
+            return None
+        p_value = chance(trial.gain, trial.freedom, tests)
+        if p_value > state.options.rules.acceptance.alpha:
+            return None
+        rivals = [rival for one in sets if (rival := _rival(state, best, one, trial)) is not None]
+        runner_up = max(rivals, key=lambda rival: rival.evidence, default=None)
+        found.append(AcceptedFinding(trial, (trial, *rivals), runner_up, p_value))
+    return tuple(found)
+
+
+def _trial(whole: Investigation, index: int) -> Trial | None:
+    """One law of a model as a trial beside all others; None where the model diverges with its laws in another order."""
+    fit, rules = whole.fit, whole.options.rules.evidence
+    turned = try_optimise(whole.problem, _with_last(fit.point, index), _TURNED, fit.whitener)
+    if turned is None:
+        return None
+    other = fit_without(whole, index)
+    if other is None:  # it diverges: every sample tells the difference
+        reduction = gain = fit.count * float(np.log(fit.count))
+    else:
+        reduction, sensors = other.chi_square - fit.chi_square, len(whole.problem.sensors)
+        gain = min(profile_gain(other.residual, fit.residual, sensors, rules.quiet, rules), reduction)
+    term = turned.point.terms[-1]
+    return Trial(
+        Candidate(term, reduction, ELEMENT), turned, gain, reduction, gain - cost(turned, rules), len(term.parameters)
+    )
+
+
+def _rival(state: Investigation, best: _Laws, other: _Laws, trial: Trial) -> Trial | None:
+    """Another set's law in the place of one of the best set's, as a trial; None where they differ by more than that."""
+    new = [i for i, name in enumerate(other.names) if name not in best.names]
+    if other.without != trial.term.law.name or len(new) != 1:
+        return None
+    fit = try_optimise(state.problem, _with_last(other.fit.point, new[0]), _TURNED, other.fit.whitener)
+    if fit is None:
+        return None
+    behind, rise = best.evidence - other.evidence, other.fit.chi_square - best.fit.chi_square
+    candidate = Candidate(fit.point.terms[-1], trial.candidate.score - rise, ELEMENT)
+    return replace(
+        trial,
+        candidate=candidate,
+        fit=fit,
+        gain=trial.gain - behind,
+        reduction=trial.reduction - rise,
+        evidence=trial.evidence - behind,
+        freedom=len(candidate.term.parameters),
+    )
+
+
+def _with_last(point: Point, index: int) -> Point:
+    """A point with one of its terms moved to the end."""
+    order = [*(i for i in range(len(point.terms)) if i != index), index]
+    forces = iter(point.warm_start)
+    of = [next(forces, None) if evaluated_in_time(term) else None for term in point.terms]
+    near = tuple(force for force in (of[i] for i in order) if force is not None)
+    return replace(point, terms=tuple(point.terms[i] for i in order), warm_start=near)
