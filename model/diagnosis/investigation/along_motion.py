@@ -110,6 +110,7 @@ def _sets_of_laws(state: Investigation, place: str) -> list[_Laws]:
         for name, found in (("", first), *others)
         if len(found.steps) > 1 and found.final.error <= near
     }
+    fits = {name: None if fit is None else _narrowed(state, fit) for name, fit in fits.items()}
     believed = {name: fit for name, fit in fits.items() if fit is not None and _is_believed(state, fit)}
     quietest = min((fit.reduced for fit in believed.values()), default=1.0)
     return [_Laws(name, fit, _evidence(state, fit, quietest)) for name, fit in believed.items()]
@@ -200,6 +201,22 @@ def _simulated(state: Investigation, start: Point) -> Fit | None:
         if on is None or on.chi_square >= fit.chi_square:
             break
         fit = on
+    return fit
+
+
+def _narrowed(state: Investigation, fit: Fit) -> Fit:
+    """The fit with laws in their narrower forms, where these are likelier: regressions hardly tell which it is."""
+    for index in range(state.given, len(fit.point.terms)):
+        term = fit.point.terms[index]
+        narrow = next((law for law in state.system.catalogue if law.wider is not None and law.wider == term.law), None)
+        if narrow is None:
+            continue
+        count = len(narrow.parameters)
+        plain = Term(narrow, term.location, term.parameters[:count], scales=term.scales[:count])
+        terms = (*fit.point.terms[:index], plain, *fit.point.terms[index + 1 :])
+        other = try_optimise(state.problem, replace(fit.point, terms=terms), _STEPS, fit.whitener)
+        if other is not None and _evidence(state, other, fit.reduced) > _evidence(state, fit, fit.reduced):
+            fit = other
     return fit
 
 
