@@ -16,6 +16,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.misfit import is_gross
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.force.fit import ComponentFit, ComponentTask, NominalValues
 from sprung.model.diagnosis.force.motion import ElementMotion
 from sprung.model.diagnosis.force.piece import Piece
@@ -67,14 +68,18 @@ def with_laws_along_motion(state: Investigation, progress: Progress) -> Investig
     progress(share_done(0), f"the force of {place} along the measured motion")
     sets = _sets_of_laws(state, place)
     best = max(sets, key=lambda one: one.evidence, default=None)
-    found = None if best is None else _findings(state, best, sets)
-    if best is None or found is None:
+    if best is None:
         return None
-    other = replace(with_model(state, best.fit), found=found)
-    other = replace(other, fit=settled(other.problem, other.fit))
+    problem, fit = refreshed(state.problem, best.fit)
+    fit = _narrowed(problem, settled(problem, fit), state.given)
+    if fit.reduced > noise_bound(problem, fit):
+        return None
+    found = _findings(state, fit.point, best, sets)
+    if found is None:
+        return None
+    other = replace(with_model(replace(state, problem=problem), fit), found=found)
     refuted = state.options.held_out and not state.held.still and state.held.compare(state.fit, other.fit).refuted
-    noise = other.fit.reduced <= noise_bound(other.problem, other.fit) and not leaves_more_than_noise(other)
-    return other if noise and not refuted else None
+    return None if refuted or leaves_more_than_noise(other) else other
 
 
 def _place(state: Investigation) -> str | None:
@@ -110,7 +115,6 @@ def _sets_of_laws(state: Investigation, place: str) -> list[_Laws]:
         for name, found in (("", first), *others)
         if len(found.steps) > 1 and found.final.error <= near
     }
-    fits = {name: None if fit is None else _narrowed(state, fit) for name, fit in fits.items()}
     believed = {name: fit for name, fit in fits.items() if fit is not None and _is_believed(state, fit)}
     quietest = min((fit.reduced for fit in believed.values()), default=1.0)
     return [_Laws(name, fit, _evidence(state, fit, quietest)) for name, fit in believed.items()]
@@ -204,18 +208,23 @@ def _simulated(state: Investigation, start: Point) -> Fit | None:
     return fit
 
 
-def _narrowed(state: Investigation, fit: Fit) -> Fit:
+def _narrowed(problem: Problem, fit: Fit, given: int) -> Fit:
     """The fit with laws in their narrower forms, where these are likelier: regressions hardly tell which it is."""
-    for index in range(state.given, len(fit.point.terms)):
-        term = fit.point.terms[index]
-        narrow = next((law for law in state.system.catalogue if law.wider is not None and law.wider == term.law), None)
+    for index in range(given, len(fit.point.terms)):
+        term, rules = fit.point.terms[index], problem.rules.evidence
+        narrow = next(
+            (law for law in problem.system.catalogue if law.wider is not None and law.wider == term.law), None
+        )
         if narrow is None:
             continue
         count = len(narrow.parameters)
         plain = Term(narrow, term.location, term.parameters[:count], scales=term.scales[:count])
-        terms = (*fit.point.terms[:index], plain, *fit.point.terms[index + 1 :])
-        other = try_optimise(state.problem, replace(fit.point, terms=terms), _STEPS, fit.whitener)
-        if other is not None and _evidence(state, other, fit.reduced) > _evidence(state, fit, fit.reduced):
+        start = replace(fit.point, terms=(*fit.point.terms[:index], plain, *fit.point.terms[index + 1 :]))
+        other = try_optimise(problem, start, _STEPS, fit.whitener)
+        if other is None:
+            continue
+        gain = profile_gain(other.residual, fit.residual, len(problem.sensors), rules.quiet, rules)
+        if min(gain, other.chi_square - fit.chi_square) < cost(fit, rules, index) - cost(other, rules, index):
             fit = other
     return fit
 
@@ -227,12 +236,18 @@ def _is_believed(state: Investigation, fit: Fit) -> bool:
     return all(doubt(fit, fit.point.terms[i], rules) is None and not hardly_there(fit, rules, i) for i in new)
 
 
-def _findings(state: Investigation, best: _Laws, sets: list[_Laws]) -> tuple[AcceptedFinding, ...] | None:
-    """Every law as a finding, by what the model without it leaves; None if one may be chance."""
-    whole = replace(state, fit=best.fit)
+def _findings(state: Investigation, point: Point, best: _Laws, sets: list[_Laws]) -> tuple[AcceptedFinding, ...] | None:
+    """Every law of a model as a finding, by what the model without it leaves; None if one may be chance.
+
+    Gains are those over the noise that was assumed before, as of a first finding.
+    """
+    fit = try_optimise(state.problem, point, _TURNED, state.fit.whitener)
+    if fit is None:
+        return None
+    whole = replace(state, fit=fit)
     tests = state.last.tried(ELEMENT) if state.options.multiplicity else 1
     found = []
-    for index in range(state.given, len(best.fit.point.terms)):
+    for index in range(state.given, len(fit.point.terms)):
         trial = _trial(whole, index)
         if trial is None or trial.evidence <= 0:
             return None
