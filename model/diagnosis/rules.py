@@ -183,6 +183,9 @@ class SelectionRules:
     most_gross: int = rule(14, "candidates that are fitted then; chosen: all laws of an element", 9, 20)
     wider: int = rule(2, "of the best laws beside another, that are fitted in their wider forms; chosen", 1, 3)
     unnamed: int = rule(2, "unnamed forces among them at one place; chosen", 1, 3)
+    several: float = rule(
+        0.5, "of that error, from which several laws of one element are sought together; chosen: cars", 0.3, 1.0
+    )
     alike: float = rule(2.0, "of the error in a force, up to which another set of laws is simulated; chosen", 1.5, 4.0)
     last: int = rule(3, "that are fitted to the end in any case; chosen", 2, 6)
     finished: int = rule(6, "that are fitted to the end when they are close; chosen", 4, 9)

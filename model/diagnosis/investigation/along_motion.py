@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
-from sprung.model.diagnosis.fit.misfit import is_gross
+from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.force.fit import ComponentFit, ComponentTask, NominalValues
@@ -40,6 +40,9 @@ from sprung.model.laws.along import force_along
 from sprung.model.system import System
 
 _STEPS, _ROUNDS = 12, 3  # of the simulation of all laws, and how often it goes on
+_FEWER = 2  # samples than of a component test, since regressions only begin the simulations
+_CLOSE = 2.0  # of chi-square, to which the likeliest set has to come to the closest
+_MOTIONS = 2  # smoothed about the model, and about the closest of the simulated ones
 _LEAST = 1e-3  # of nominal, of a spring or damper that a force seems not to have
 _TURNED = 2  # of the same model with its laws in another order
 
@@ -63,13 +66,25 @@ def with_laws_along_motion(state: Investigation, progress: Progress) -> Investig
     Only where the model is far from the recording, and before anything was found.
     """
     place = _place(state)
-    if state.found or place is None or not is_gross(state.problem, state.fit):
+    if state.found or state.problem.process_noise or place is None or not _lacks_several(state, place):
         return None
-    progress(share_done(0), f"the force of {place} along the measured motion")
-    sets = _sets_of_laws(state, place)
-    best = max(sets, key=lambda one: one.evidence, default=None)
-    if best is None:
-        return None
+    near: Fit | None = state.fit
+    for _ in range(_MOTIONS):
+        if near is None:
+            break
+        progress(share_done(0), f"the force of {place} along the measured motion")
+        sets, near = _sets_of_laws(state, place, near)
+        best = max(sets, key=lambda one: one.evidence, default=None)
+        if best is None or (near is not None and near.chi_square < best.fit.chi_square / _CLOSE):
+            continue  # an implausible set is much closer to the recording: the motion first
+        found = _accepted(state, best, sets)
+        if found is not None:
+            return found
+    return None
+
+
+def _accepted(state: Investigation, best: _Laws, sets: list[_Laws]) -> Investigation | None:
+    """The investigation with a set of laws as findings; None if more than noise is left, or one may be chance."""
     problem, fit = refreshed(state.problem, best.fit)
     fit = _narrowed(problem, settled(problem, fit), state.given)
     if fit.reduced > noise_bound(problem, fit):
@@ -90,34 +105,49 @@ def _place(state: Investigation) -> str | None:
     return best.location if best is not None and best.location in state.system.elements else None
 
 
-def _sets_of_laws(state: Investigation, place: str) -> list[_Laws]:
+def _lacks_several(state: Investigation, place: str) -> bool:
+    """Whether an element's model is far from the recording, and a force without a name promises more than any law."""
+    rules = state.options.rules.selection
+    here = [one for one in state.last.candidates if one.location == place]
+    named = max((one.score for one in here if one.term.law.named), default=0.0)
+    unnamed = max((one.score for one in here if not one.term.law.named), default=0.0)
+    error = float(np.sqrt(np.mean(misfit(state.fit))))
+    return error > rules.several * rules.gross and unnamed > rules.unnamed_ratio * named
+
+
+def _sets_of_laws(state: Investigation, place: str, near: Fit) -> tuple[list[_Laws], Fit | None]:
     """Sets of plausible laws of an element, as simulated: the likeliest, and likely ones without one of it.
 
-    None where a single law makes the force: it competes with those of other places (`next_finding`).
-
     Regressions prefer one set to another by little where the smoothed motion is not exactly the measured one, and the
-    simulations of both by far.
+    simulations of both by far.  None where a single law makes the force: it competes with those of other places
+    (`next_finding`).
+
+    near: a model about whose motion the measured one is smoothed.  Second: the closest of those simulated, plausible or
+    not: the smoothed motion is nearer to the measured one about it.  None: there is no closer one.
     """
-    measured = MeasuredMotion.of(state.problem, state.fit)
+    measured = MeasuredMotion.of(state.problem, near)
     if measured is None:
-        return []
+        return [], None
     along = MeasuredMotion(*refreshed(measured.problem, measured.fit))
-    force, pieces = along.force_of(place), _pieces(state.problem.system)
+    force, pieces = along.force_of(place, state.given), _pieces(state.problem.system)
     task = _task(state, place, force, along.fit)
     first = search(task, pieces, lags=())
     names = list(dict.fromkeys(piece.effect for piece in first.final.model.pieces))
     if len(names) < 2:
-        return []
+        return [], None
     others = [(name, search(task, tuple(p for p in pieces if p.effect != name), lags=())) for name in names]
-    near = state.options.rules.selection.alike * first.final.error
+    most = state.options.rules.selection.alike * first.final.error
     fits = {
         name: _simulated(state, _start(state, place, found.final, force, along.fit))
         for name, found in (("", first), *others)
-        if len(found.steps) > 1 and found.final.error <= near
+        if len(found.steps) > 1 and found.final.error <= most
     }
-    believed = {name: fit for name, fit in fits.items() if fit is not None and _is_believed(state, fit)}
+    finished = {name: fit for name, fit in fits.items() if fit is not None}
+    believed = {name: fit for name, fit in finished.items() if _is_believed(state, fit)}
     quietest = min((fit.reduced for fit in believed.values()), default=1.0)
-    return [_Laws(name, fit, _evidence(state, fit, quietest)) for name, fit in believed.items()]
+    closest = min((*finished.values(), near), key=lambda fit: fit.chi_square)
+    sets = [_Laws(name, fit, _evidence(state, fit, quietest)) for name, fit in believed.items()]
+    return sets, None if closest is near else closest
 
 
 def _evidence(state: Investigation, fit: Fit, quietest: float) -> float:
@@ -130,7 +160,7 @@ def _evidence(state: Investigation, fit: Fit, quietest: float) -> float:
 def _task(state: Investigation, place: str, force: ForceAlongMotion, along: Fit) -> ComponentTask:
     """The force of an element along a motion, as that of a component test."""
     rules = state.options.rules
-    return ComponentTask(
+    whole = ComponentTask(
         motion=ElementMotion.of(force.time, force.deflection, force.rate, 0.0, 0.0),
         force=force.force,
         split=int(rules.record.fitted * len(force.force)),
@@ -138,6 +168,7 @@ def _task(state: Investigation, place: str, force: ForceAlongMotion, along: Fit)
         rules=rules.component,
         noise=white_noise(force.force, rules.white_noise),
     )
+    return whole.every(max(1, _FEWER * len(force.force) // rules.component.search))
 
 
 def _start(state: Investigation, place: str, found: ComponentFit, force: ForceAlongMotion, along: Fit) -> Point:
@@ -147,7 +178,7 @@ def _start(state: Investigation, place: str, found: ComponentFit, force: ForceAl
         if parameter.element == place:
             value = max(float(getattr(found.element, parameter.quantity)), _LEAST * parameter.nominal)
             theta[index] = np.log(value / parameter.nominal)
-    terms = (*along.point.terms, *_terms(found, place, force))
+    terms = (*along.point.terms[: state.given], *_terms(found, place, force))
     return _started(state, Point(theta, terms, np.zeros_like(state.fit.point.state)), along)
 
 
@@ -185,7 +216,7 @@ def _started(state: Investigation, point: Point, along: Fit) -> Point:
     """A point with the forces of its laws along a motion as the start of their simulation."""
     grid = along.forward.part.grid
     time, forces = grid.start + grid.fine_time, []
-    elements = state.problem.forward(replace(point, terms=along.point.terms))
+    elements = state.problem.forward(replace(point, terms=along.point.terms[: state.given]))
     for term in point.terms:
         if evaluated_in_time(term):
             d, v = (motion @ term.port(state.problem.system) for motion in along.element_motion)

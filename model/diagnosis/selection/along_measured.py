@@ -37,7 +37,7 @@ class ForceAlongMotion:
     time: FloatArray  # s since the start of the recording, (T,)
     deflection: FloatArray  # m, (T,)
     rate: FloatArray  # m/s, (T,)
-    force: FloatArray  # N, without that of the system file's laws, (T,)
+    force: FloatArray  # N, of spring, damper, and whatever the system file lacks, (T,)
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,11 @@ class MeasuredMotion:
         fit = try_optimise(along, start, _STEPS)
         return None if fit is None else cls(along, fit)
 
-    def force_of(self, element: str) -> ForceAlongMotion:
+    def force_of(self, element: str, given: int) -> ForceAlongMotion:
         """The force of an element: of its spring and damper, and the unmeasured one of the body that tells it best.
 
         That is the body with the fewest other elements, whose errors it contains too; of two such, the mean.
+        given: number of the system file's laws, the first terms; the force of others is part of the result.
         """
         system, fit, thin = self.problem.system, self.fit, slice(None, None, OVERSAMPLING)
         part, grid = fit.forward.part, fit.forward.part.grid
@@ -93,6 +94,7 @@ class MeasuredMotion:
         d, v = (motion @ port for motion in fit.element_motion)
         own = fit.forward.element_at(element)
         force = float(own.stiffness) * d + float(own.damping) * v + missing
+        force = sum((fit.force_along(term) for term in fit.point.terms[given:] if term.location == element), force)
         return ForceAlongMotion((grid.start + grid.fine_time)[thin], d[thin], v[thin], force[thin])
 
     def wider(self, index: int) -> Point | None:
