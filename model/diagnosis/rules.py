@@ -186,6 +186,7 @@ class SelectionRules:
     several: float = rule(
         0.5, "of that error, from which several laws of one element are sought together; chosen: cars", 0.3, 1.0
     )
+    together: float = rule(0.5, "of the work of a search, on top of it, for that; chosen", 0.3, 1.0)
     alike: float = rule(2.0, "of the error in a force, up to which another set of laws is simulated; chosen", 1.5, 4.0)
     last: int = rule(3, "that are fitted to the end in any case; chosen", 2, 6)
     finished: int = rule(6, "that are fitted to the end when they are close; chosen", 4, 9)

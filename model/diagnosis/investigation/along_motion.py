@@ -9,7 +9,7 @@ it.  Its laws are found by regressions (`force.search`) and then simulated toget
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from sprung.model.diagnosis.force.motion import ElementMotion
 from sprung.model.diagnosis.force.piece import Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.search import search
-from sprung.model.diagnosis.investigation.judgement import leaves_more_than_noise
 from sprung.model.diagnosis.investigation.redundant import fit_without
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress, share_done
 from sprung.model.diagnosis.investigation.widened import with_model
@@ -31,8 +30,8 @@ from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import WIDER, Term, evaluated_in_time
 from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.diagnosis.selection.along_measured import ForceAlongMotion, MeasuredMotion
-from sprung.model.diagnosis.selection.compete import Trial, cost, noise_bound
+from sprung.model.diagnosis.selection.along_measured import ForceAlongMotion, MeasuredMotion, force_along_motion
+from sprung.model.diagnosis.selection.compete import Trial, cost
 from sprung.model.diagnosis.selection.evidence import chance, profile_gain
 from sprung.model.diagnosis.selection.plausible import doubt, hardly_there
 from sprung.model.laws import ElementLaw, Law, SpringDamper, observe
@@ -40,61 +39,43 @@ from sprung.model.laws.along import force_along
 from sprung.model.system import System
 
 _STEPS, _ROUNDS = 12, 3  # of the simulation of all laws, and how often it goes on
-_FEWER = 2  # samples than of a component test, since regressions only begin the simulations
-_CLOSE = 2.0  # of chi-square, to which the likeliest set has to come to the closest
-_MOTIONS = 2  # smoothed about the model, and about the closest of the simulated ones
+_FINE = 0.02  # of the misfit, up to which the first plausible set is taken
 _LEAST = 1e-3  # of nominal, of a spring or damper that a force seems not to have
 _TURNED = 2  # of the same model with its laws in another order
 
 
-@dataclass(frozen=True)
-class _Laws:
-    """Several laws of one element, simulated together."""
-
-    without: str  # name of the law that was left out of their search; empty: none
-    fit: Fit
-    evidence: float  # over the model without them
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(term.law.name for term in self.fit.point.terms)
-
-
 def with_laws_along_motion(state: Investigation, progress: Progress) -> Investigation | None:
-    """The investigation with several laws of one element as findings, if these leave nothing but noise; else None.
+    """The investigation with several laws of one element as findings; None where these are no plausible ones.
 
     Only where the model is far from the recording, and before anything was found.
     """
     place = _place(state)
     if state.found or state.problem.process_noise or place is None or not _lacks_several(state, place):
         return None
-    near: Fit | None = state.fit
-    for _ in range(_MOTIONS):
-        if near is None:
-            break
-        progress(share_done(0), f"the force of {place} along the measured motion")
-        sets, near = _sets_of_laws(state, place, near)
-        best = max(sets, key=lambda one: one.evidence, default=None)
-        if best is None or (near is not None and near.chi_square < best.fit.chi_square / _CLOSE):
-            continue  # an implausible set is much closer to the recording: the motion first
-        found = _accepted(state, best, sets)
-        if found is not None:
-            return found
-    return None
-
-
-def _accepted(state: Investigation, best: _Laws, sets: list[_Laws]) -> Investigation | None:
-    """The investigation with a set of laws as findings; None if more than noise is left, or one may be chance."""
-    problem, fit = refreshed(state.problem, best.fit)
-    fit = _narrowed(problem, settled(problem, fit), state.given)
-    if fit.reduced > noise_bound(problem, fit):
+    progress(share_done(0), f"the force of {place} along the measured motion")
+    fits = _sets_of_laws(state, place)
+    if not fits:
         return None
+    closest = min(fits, key=lambda fit: fit.chi_square)
+    wrong = _doubted(state, closest)
+    if wrong:  # its force is close to the true one, which plausible laws have to make
+        progress(share_done(0), f"the force of {place} along the simulated motion")
+        fits += _sets_beside(state, place, closest, wrong)
+    believed = [fit for fit in fits if not _doubted(state, fit)]
+    best = min(believed, key=lambda fit: fit.chi_square, default=None)
+    return None if best is None else _accepted(state, best, believed)
+
+
+def _accepted(state: Investigation, best: Fit, sets: list[Fit]) -> Investigation | None:
+    """The investigation with a set of laws as findings; None if one may be chance, or the held-out part refutes it."""
+    problem, fit = refreshed(state.problem, best)
+    fit = _narrowed(problem, settled(problem, fit), state.given)
     found = _findings(state, fit.point, best, sets)
     if found is None:
         return None
     other = replace(with_model(replace(state, problem=problem), fit), found=found)
     refuted = state.options.held_out and not state.held.still and state.held.compare(state.fit, other.fit).refuted
-    return None if refuted or leaves_more_than_noise(other) else other
+    return None if refuted else other
 
 
 def _place(state: Investigation) -> str | None:
@@ -115,60 +96,58 @@ def _lacks_several(state: Investigation, place: str) -> bool:
     return error > rules.several * rules.gross and unnamed > rules.unnamed_ratio * named
 
 
-def _sets_of_laws(state: Investigation, place: str, near: Fit) -> tuple[list[_Laws], Fit | None]:
-    """Sets of plausible laws of an element, as simulated: the likeliest, and likely ones without one of it.
+def _sets_of_laws(state: Investigation, place: str) -> list[Fit]:
+    """Sets of laws of an element, as simulated: the likeliest, and if that is no good, likely ones without one of it.
 
     Regressions prefer one set to another by little where the smoothed motion is not exactly the measured one, and the
     simulations of both by far.  None where a single law makes the force: it competes with those of other places
     (`next_finding`).
-
-    near: a model about whose motion the measured one is smoothed.  Second: the closest of those simulated, plausible or
-    not: the smoothed motion is nearer to the measured one about it.  None: there is no closer one.
     """
-    measured = MeasuredMotion.of(state.problem, near)
+    measured = MeasuredMotion.of(state.problem, state.fit)
     if measured is None:
-        return [], None
+        return []
     along = MeasuredMotion(*refreshed(measured.problem, measured.fit))
-    force, pieces = along.force_of(place, state.given), _pieces(state.problem.system)
+    force, pieces = along.force_of(place), _pieces(state.problem.system)
     task = _task(state, place, force, along.fit)
     first = search(task, pieces, lags=())
-    names = list(dict.fromkeys(piece.effect for piece in first.final.model.pieces))
+    names = dict.fromkeys(piece.effect for piece in first.final.model.pieces)
     if len(names) < 2:
-        return [], None
-    others = [(name, search(task, tuple(p for p in pieces if p.effect != name), lags=())) for name in names]
+        return []
+    fit = _simulated(state, _start(state, place, first.final, force, along.fit))
+    if fit is not None and fit.chi_square < _FINE * state.fit.chi_square and not _doubted(state, fit):
+        return [fit]
     most = state.options.rules.selection.alike * first.final.error
-    fits = {
-        name: _simulated(state, _start(state, place, found.final, force, along.fit))
-        for name, found in (("", first), *others)
-        if len(found.steps) > 1 and found.final.error <= most
-    }
-    finished = {name: fit for name, fit in fits.items() if fit is not None}
-    believed = {name: fit for name, fit in finished.items() if _is_believed(state, fit)}
-    quietest = min((fit.reduced for fit in believed.values()), default=1.0)
-    closest = min((*finished.values(), near), key=lambda fit: fit.chi_square)
-    sets = [_Laws(name, fit, _evidence(state, fit, quietest)) for name, fit in believed.items()]
-    return sets, None if closest is near else closest
+    others = (search(task, tuple(p for p in pieces if p.effect != name), lags=()) for name in names)
+    starts = [
+        _start(state, place, other.final, force, along.fit)
+        for other in others
+        if len(other.steps) > 1 and other.final.error <= most
+    ]
+    return [one for one in (fit, *(_simulated(state, start) for start in starts)) if one is not None]
 
 
-def _evidence(state: Investigation, fit: Fit, quietest: float) -> float:
-    """Evidence of a model with several laws over the one without; quietest: the least reduced chi-square of several."""
-    rules, sensors = state.options.rules.evidence, len(state.problem.sensors)
-    gain = profile_gain(state.fit.residual, fit.residual, sensors, rules.quiet * min(quietest, 1.0), rules)
-    return gain - sum(cost(fit, rules, index) for index in range(state.given, len(fit.point.terms)))
+def _sets_beside(state: Investigation, place: str, near: Fit, wrong: set[str]) -> list[Fit]:
+    """A set of laws that makes the force of a simulated model without some of its laws, as simulated."""
+    force = force_along_motion(near, place)
+    pieces = tuple(piece for piece in _pieces(state.problem.system) if piece.effect not in wrong)
+    found = search(_task(state, place, force, near), pieces, lags=())
+    fit = _simulated(state, _start(state, place, found.final, force, near)) if found.steps else None
+    return [] if fit is None else [fit]
 
 
 def _task(state: Investigation, place: str, force: ForceAlongMotion, along: Fit) -> ComponentTask:
     """The force of an element along a motion, as that of a component test."""
     rules = state.options.rules
-    whole = ComponentTask(
+    return ComponentTask(
         motion=ElementMotion.of(force.time, force.deflection, force.rate, 0.0, 0.0),
         force=force.force,
         split=int(rules.record.fitted * len(force.force)),
         nominal=_held(state.problem.system, place, along),
-        rules=rules.component,
+        rules=replace(
+            rules.component, search=len(force.force)
+        ),  # thinned out, it would not resolve the knees of valves
         noise=white_noise(force.force, rules.white_noise),
     )
-    return whole.every(max(1, _FEWER * len(force.force) // rules.component.search))
 
 
 def _start(state: Investigation, place: str, found: ComponentFit, force: ForceAlongMotion, along: Fit) -> Point:
@@ -260,14 +239,14 @@ def _narrowed(problem: Problem, fit: Fit, given: int) -> Fit:
     return fit
 
 
-def _is_believed(state: Investigation, fit: Fit) -> bool:
-    """Whether all laws have plausible values and are there."""
+def _doubted(state: Investigation, fit: Fit) -> set[str]:
+    """Names of the laws whose values are implausible, or that are hardly there."""
     rules = state.options.rules.plausible
-    new = range(state.given, len(fit.point.terms))
-    return all(doubt(fit, fit.point.terms[i], rules) is None and not hardly_there(fit, rules, i) for i in new)
+    new = [(index, fit.point.terms[index]) for index in range(state.given, len(fit.point.terms))]
+    return {t.law.name for i, t in new if doubt(fit, t, rules) is not None or hardly_there(fit, rules, i)}
 
 
-def _findings(state: Investigation, point: Point, best: _Laws, sets: list[_Laws]) -> tuple[AcceptedFinding, ...] | None:
+def _findings(state: Investigation, point: Point, best: Fit, sets: list[Fit]) -> tuple[AcceptedFinding, ...] | None:
     """Every law of a model as a finding, by what the model without it leaves; None if one may be chance.
 
     Gains are those over the noise that was assumed before, as of a first finding.
@@ -309,15 +288,17 @@ def _trial(whole: Investigation, index: int) -> Trial | None:
     )
 
 
-def _rival(state: Investigation, best: _Laws, other: _Laws, trial: Trial) -> Trial | None:
-    """Another set's law in the place of one of the best set's, as a trial; None where they differ by more than that."""
-    new = [i for i, name in enumerate(other.names) if name not in best.names]
-    if other.without != trial.term.law.name or len(new) != 1:
+def _rival(state: Investigation, best: Fit, other: Fit, trial: Trial) -> Trial | None:
+    """The law of another set in the place of one of the best set's, as a trial; None where they differ by more."""
+    names = [[term.law.name for term in fit.point.terms] for fit in (best, other)]
+    new = [index for index, name in enumerate(names[1]) if name not in names[0]]
+    if {*names[0]} - {*names[1]} != {trial.term.law.name} or len(new) != 1:
         return None
-    fit = try_optimise(state.problem, _with_last(other.fit.point, new[0]), _TURNED, other.fit.whitener)
+    fit = try_optimise(state.problem, _with_last(other.point, new[0]), _TURNED, other.whitener)
     if fit is None:
         return None
-    behind, rise = best.evidence - other.evidence, other.fit.chi_square - best.fit.chi_square
+    rules, rise = state.options.rules.evidence, other.chi_square - best.chi_square
+    behind = profile_gain(other.residual, best.residual, len(state.problem.sensors), rules.quiet, rules)
     candidate = Candidate(fit.point.terms[-1], trial.candidate.score - rise, ELEMENT)
     return replace(
         trial,
@@ -325,8 +306,8 @@ def _rival(state: Investigation, best: _Laws, other: _Laws, trial: Trial) -> Tri
         fit=fit,
         gain=trial.gain - behind,
         reduction=trial.reduction - rise,
-        evidence=trial.evidence - behind,
-        freedom=len(candidate.term.parameters),
+        evidence=trial.gain - behind - cost(fit, rules),
+        freedom=candidate.freedom,
     )
 
 

@@ -16,6 +16,7 @@ from sprung.model.diagnosis.investigation.inputs import best_input_fault, compen
 from sprung.model.diagnosis.investigation.judgement import (
     another_structure,
     judged,
+    leaves_more_than_noise,
     unmeasured_share,
 )
 from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covariance
@@ -68,10 +69,34 @@ def investigate(system: System, record: Recorded, options: Options, progress: Pr
 
 
 def with_findings(state: Investigation, progress: Progress) -> Investigation:
-    """Findings until the residual is noise."""
+    """Findings until the residual is noise: several laws of one element first, or one by one where more is left."""
+    if not any(fault.value is not None for fault in state.setup_faults):
+        several = _with_several(state, progress)
+        if several is not None:
+            return several
+    return _one_by_one(state, progress)
+
+
+def _with_several(state: Investigation, progress: Progress) -> Investigation | None:
+    """Findings that begin with several laws of one element at once; None if more than noise is left, or there are none.
+
+    It has work of its own: what it takes, the search one by one does not lack.
+    """
+    work = state.problem.work
+    own = None if work is None else work.portion(state.options.rules.selection.together)
+    several = with_laws_along_motion(replace(state, problem=replace(state.problem, work=own)), progress)
+    if several is None:
+        return None
+    several = _one_by_one(several, progress)
+    if leaves_more_than_noise(several) or several.fit.reduced > noise_bound(several.problem, several.fit):
+        return None
+    return replace(several, problem=replace(several.problem, work=work))
+
+
+def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
+    """Findings one after the other, until the residual is noise."""
     # the residual of an estimated delay, scale or position is not searched for unmodelled dynamics
     uncertain, notes = any(fault.value is not None for fault in state.setup_faults), state.notes
-    state = (None if uncertain else with_laws_along_motion(state, progress)) or state
     for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
         before = state
         state = next_finding(state, number, progress)

@@ -79,8 +79,8 @@ def rivals_of_wider(state: Investigation, wide: WidenedFit) -> list[Candidate]:
     here = [one for one in untried(state, state.last.candidates) if one.location == place and one.term.law.named]
     alone = replace(state.last, candidates=tuple(here))
     close = shortlist(alone, options.rules.acceptance.alpha, options.multiplicity, options.rules)
-    starts = {one: matched_starts(state.problem, state.fit, wide.fit, wide.index, one) for one in close}
-    return [*close, *(replace(one, start=start) for one, more in starts.items() for start in more)]
+    starts = [(one, matched_starts(state.problem, state.fit, wide.fit, wide.index, one)) for one in close]
+    return [*close, *(replace(one, start=start) for one, more in starts for start in more)]
 
 
 def adopt_wider(state: Investigation, wide: WidenedFit) -> Investigation:

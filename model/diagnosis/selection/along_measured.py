@@ -16,7 +16,7 @@ from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time, given_terms
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.starts import joint_start, seen, wider_starts
 from sprung.model.schema import ForceInput
@@ -38,6 +38,16 @@ class ForceAlongMotion:
     deflection: FloatArray  # m, (T,)
     rate: FloatArray  # m/s, (T,)
     force: FloatArray  # N, of spring, damper, and whatever the system file lacks, (T,)
+
+
+def force_along_motion(fit: Fit, element: str) -> ForceAlongMotion:
+    """The force of an element along a fit's own motion: of spring, damper and the laws that are not the file's."""
+    system, grid, thin = fit.forward.system, fit.forward.part.grid, slice(None, None, OVERSAMPLING)
+    d, v = (motion[:, system.elements.index(element)] for motion in fit.element_motion)
+    own, given = fit.forward.element_at(element), len(given_terms(system))
+    laws = [fit.force_along(term) for term in fit.point.terms[given:] if term.location == element]
+    force = float(own.stiffness) * d + float(own.damping) * v + np.sum(laws, axis=0)
+    return ForceAlongMotion((grid.start + grid.fine_time)[thin], d[thin], v[thin], force[thin])
 
 
 @dataclass(frozen=True)
@@ -71,31 +81,22 @@ class MeasuredMotion:
         fit = try_optimise(along, start, _STEPS)
         return None if fit is None else cls(along, fit)
 
-    def force_of(self, element: str, given: int) -> ForceAlongMotion:
-        """The force of an element: of its spring and damper, and the unmeasured one of the body that tells it best.
+    def force_of(self, element: str) -> ForceAlongMotion:
+        """The force of an element: its own, and the unmeasured one of the body that tells it best.
 
         That is the body with the fewest other elements, whose errors it contains too; of two such, the mean.
-        given: number of the system file's laws, the first terms; the force of others is part of the result.
         """
-        system, fit, thin = self.problem.system, self.fit, slice(None, None, OVERSAMPLING)
-        part, grid = fit.forward.part, fit.forward.part.grid
+        system, part, grid = self.problem.system, self.fit.forward.part, self.fit.forward.part.grid
         bodies, elements = list(system.bodies), system.file.elements
-        ends = {
-            end: sign
-            for end, sign in ((elements[element].upper, -1.0), (elements[element].lower, 1.0))
-            if end in bodies
-        }
+        both = {elements[element].upper: -1.0, elements[element].lower: 1.0}
+        ends = {end: sign for end, sign in both.items() if end in bodies}
         others = {body: sum(body in (one.upper, one.lower) for one in elements.values()) for body in ends}
         near = [body for body in ends if others[body] == min(others.values())]
         unmeasured = grid.fine(part.force) + grid.fine_monomials @ part.force_polynomial
         columns = {body: len(part.force[0]) - len(bodies) + bodies.index(body) for body in near}
         missing = np.mean([ends[body] * unmeasured[:, columns[body]] for body in near], axis=0)
-        port = np.eye(len(system.elements))[system.elements.index(element)]
-        d, v = (motion @ port for motion in fit.element_motion)
-        own = fit.forward.element_at(element)
-        force = float(own.stiffness) * d + float(own.damping) * v + missing
-        force = sum((fit.force_along(term) for term in fit.point.terms[given:] if term.location == element), force)
-        return ForceAlongMotion((grid.start + grid.fine_time)[thin], d[thin], v[thin], force[thin])
+        own = force_along_motion(self.fit, element)
+        return replace(own, force=own.force + missing[::OVERSAMPLING])
 
     def wider(self, index: int) -> Point | None:
         """The present model with one of its laws in the wider form, fitted along the measured motion; None: no form."""

@@ -25,7 +25,7 @@ def test_the_force_of_a_strut_is_what_accelerates_its_body(rig: ShakenRig) -> No
     problem, base = baseline(rig.system, signals, declared_noise(rig.system, signals), signals.samples)
     measured = MeasuredMotion.of(problem, base)
     assert measured is not None
-    found = MeasuredMotion(*refreshed(measured.problem, measured.fit)).force_of("strut", 0)
+    found = MeasuredMotion(*refreshed(measured.problem, measured.fit)).force_of("strut")
     accelerates = -BODY * signals.sensors[:, list(signals.sensor_names).index("body")]
     force = np.interp(np.arange(len(accelerates)) / rig.sample_rate, found.time, found.force)
     inner = slice(200, -200)
