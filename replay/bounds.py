@@ -20,10 +20,7 @@ from sprung.replay.inflate import LARGEST, PIECE
 SAMPLES_ALWAYS, SAMPLES_PER_BYTE = 10_000_000, 100  # that a file may give; well packed ones give about 5 a byte
 WHOLE_ALWAYS, WHOLE_RATIO = 1 << 28, 100  # bytes that a file which is read whole may unpack to, and times its size
 FOR_ITS_SIZE = "a file of its size can hold"
-COMPRESSED, MATRIX = (
-    15,
-    14,
-)  # miCOMPRESSED, a variable in zlib's format, miMATRIX (MATLAB's "MAT-File Format", table 1-1)
+MATRIX, COMPRESSED = 14, 15  # miMATRIX, and a variable in zlib's format (MATLAB's "MAT-File Format", table 1-1)
 SMALL = 1 << 16  # a kind from this on has its size beside it, and its value in the tag
 DEEPEST_ARRAY = 500  # arrays inside each other; SciPy takes some thousands
 MAT_HEADER = 128

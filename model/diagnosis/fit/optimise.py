@@ -136,6 +136,18 @@ def try_optimise(problem: Problem, start: Point, iterations: int, whitener: Whit
     return fit if np.isfinite(fit.chi_square) else None
 
 
+def falling(problem: Problem, fit: Fit, iterations: int, rounds: int) -> Fit:
+    """A fit that goes on with the same weights, in rounds of `iterations`, until it converges or falls no more."""
+    for _ in range(rounds):
+        if fit.converged:
+            break
+        on = try_optimise(problem, fit.point, iterations, fit.whitener)
+        if on is None or on.chi_square >= fit.chi_square:
+            break
+        fit = on
+    return fit
+
+
 def optimise(
     problem: Problem,
     start: Point,

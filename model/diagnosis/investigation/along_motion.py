@@ -15,7 +15,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.misfit import misfit
-from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.fit.optimise import Fit, falling, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.force.fit import ComponentFit, ComponentTask, NominalValues
 from sprung.model.diagnosis.force.motion import ElementMotion
@@ -31,7 +31,7 @@ from sprung.model.diagnosis.response.terms import WIDER, Term, evaluated_in_time
 from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.along_measured import ForceAlongMotion, MeasuredMotion, force_along_motion
-from sprung.model.diagnosis.selection.compete import Trial, cost
+from sprung.model.diagnosis.selection.compete import Trial, cost, gain_over
 from sprung.model.diagnosis.selection.evidence import chance, profile_gain
 from sprung.model.diagnosis.selection.plausible import doubt, hardly_there
 from sprung.model.laws import ElementLaw, Law, SpringDamper, observe
@@ -74,8 +74,7 @@ def _accepted(state: Investigation, best: Fit, sets: list[Fit]) -> Investigation
     if found is None:
         return None
     other = replace(with_model(replace(state, problem=problem), fit), found=found)
-    refuted = state.options.held_out and not state.held.still and state.held.compare(state.fit, other.fit).refuted
-    return None if refuted else other
+    return None if state.refutes(other.fit) else other
 
 
 def _place(state: Investigation) -> str | None:
@@ -143,9 +142,8 @@ def _task(state: Investigation, place: str, force: ForceAlongMotion, along: Fit)
         force=force.force,
         split=int(rules.record.fitted * len(force.force)),
         nominal=_held(state.problem.system, place, along),
-        rules=replace(
-            rules.component, search=len(force.force)
-        ),  # thinned out, it would not resolve the knees of valves
+        # thinned out, the motion does not resolve the knees of valves
+        rules=replace(rules.component, search=len(force.force)),
         noise=white_noise(force.force, rules.white_noise),
     )
 
@@ -206,16 +204,8 @@ def _started(state: Investigation, point: Point, along: Fit) -> Point:
 
 def _simulated(state: Investigation, start: Point) -> Fit | None:
     """The fit of all laws to the recording; None where it diverges."""
-    whitener = state.fit.whitener
-    fit = try_optimise(state.problem, start, _STEPS, whitener)
-    for _ in range(_ROUNDS):
-        if fit is None or fit.converged:
-            break
-        on = try_optimise(state.problem, fit.point, _STEPS, whitener)
-        if on is None or on.chi_square >= fit.chi_square:
-            break
-        fit = on
-    return fit
+    fit = try_optimise(state.problem, start, _STEPS, state.fit.whitener)
+    return None if fit is None else falling(state.problem, fit, _STEPS, _ROUNDS)
 
 
 def _narrowed(problem: Problem, fit: Fit, given: int) -> Fit:
@@ -233,8 +223,8 @@ def _narrowed(problem: Problem, fit: Fit, given: int) -> Fit:
         other = try_optimise(problem, start, _STEPS, fit.whitener)
         if other is None:
             continue
-        gain = profile_gain(other.residual, fit.residual, len(problem.sensors), rules.quiet, rules)
-        if min(gain, other.chi_square - fit.chi_square) < cost(fit, rules, index) - cost(other, rules, index):
+        gain, _ = gain_over(problem, other, fit, rules.quiet)
+        if gain < cost(fit, rules, index) - cost(other, rules, index):
             fit = other
     return fit
 
@@ -280,8 +270,7 @@ def _trial(whole: Investigation, index: int) -> Trial | None:
     if other is None:  # it diverges: every sample tells the difference
         reduction = gain = fit.count * float(np.log(fit.count))
     else:
-        reduction, sensors = other.chi_square - fit.chi_square, len(whole.problem.sensors)
-        gain = min(profile_gain(other.residual, fit.residual, sensors, rules.quiet, rules), reduction)
+        gain, reduction = gain_over(whole.problem, other, fit, rules.quiet)
     term = turned.point.terms[-1]
     return Trial(
         Candidate(term, reduction, ELEMENT), turned, gain, reduction, gain - cost(turned, rules), len(term.parameters)

@@ -105,8 +105,8 @@ def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
         if state.calibrations and not before.calibrations:  # the search restarts with them in the model
             return with_findings(replace(state, notes=notes), progress)
         if len(state.found) == len(before.found):
-            return with_laws_together(state, lambda plain: with_findings(plain, progress))
-        state = with_named_laws(before, state, lambda plain: with_findings(plain, progress), progress)
+            return with_laws_together(state, lambda plain: _one_by_one(plain, progress))
+        state = with_named_laws(before, state, lambda plain: _one_by_one(plain, progress), progress)
         state = restated(without_redundant(state))
         if _still_rejected(state, before.fit) or another_structure(state):
             break  # further findings would only imitate another structure

@@ -182,7 +182,7 @@ def _contains(trials: list[Trial], trial: Trial) -> bool:
 
 def _is_acceptable(state: Investigation, trial: Trial) -> bool:
     """Whether a trial is neither chance nor refuted by the held-out part."""
-    return _p_value(state, trial) <= state.options.rules.acceptance.alpha and not _is_refuted(state, trial)
+    return _p_value(state, trial) <= state.options.rules.acceptance.alpha and not state.refutes(trial.fit)
 
 
 def _p_value(state: Investigation, chosen: Trial) -> float:
@@ -199,13 +199,6 @@ def _whole(state: Investigation) -> float:
     if not state.options.held_out or state.held.still or state.problem.process_noise:
         return 1.0
     return state.held.signals.samples / state.held.split
-
-
-def _is_refuted(state: Investigation, chosen: Trial) -> bool:
-    """Whether the held-out part refutes a trial; not where it hardly moves, or is not asked."""
-    if not state.options.held_out or state.held.still:
-        return False
-    return state.held.compare(state.fit, chosen.fit).refuted
 
 
 def _implausible_note(trial: Trial, reason: str) -> str:

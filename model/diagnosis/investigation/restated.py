@@ -45,8 +45,7 @@ def restated(state: Investigation) -> Investigation:
             if told is None or trial is None:
                 continue
             margin = _margin(state, told, at)
-            refuted = state.options.held_out and not state.held.still and state.held.compare(state.fit, told).refuted
-            if margin > 0 and not refuted:
+            if margin > 0 and not state.refutes(told):
                 state = _adopted(state, told, index, replace(trial, evidence=found.trial.evidence + margin))
                 return restated(state)
             lost = replace(trial, evidence=found.trial.evidence + min(margin, 0.0))

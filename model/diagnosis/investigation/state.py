@@ -161,6 +161,10 @@ class Investigation:
         """Number of laws of the system file, the first terms of every fit."""
         return len(self.base.point.terms)
 
+    def refutes(self, fit: Fit) -> bool:
+        """Whether the held-out part refutes a fit beside the present one; not where it hardly moves, or is not used."""
+        return self.options.held_out and not self.held.still and self.held.compare(self.fit, fit).refuted
+
 
 @dataclass(frozen=True)
 class Judgement:

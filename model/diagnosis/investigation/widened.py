@@ -13,14 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed
-from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.fit.optimise import Fit, falling, try_optimise
 from sprung.model.diagnosis.investigation.minor import untried
 from sprung.model.diagnosis.investigation.state import Investigation, TriedWider, WidenedFit
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.along_measured import MeasuredMotion
-from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete, noise_bound, shortlist
-from sprung.model.diagnosis.selection.evidence import occam_cost, profile_gain
+from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete, gain_over, noise_bound, shortlist
+from sprung.model.diagnosis.selection.evidence import occam_cost
 from sprung.model.diagnosis.selection.matched import matched_starts
 from sprung.model.diagnosis.selection.plausible import doubt
 from sprung.model.diagnosis.selection.starts import wider_starts
@@ -65,8 +65,7 @@ def is_better(state: Investigation, wide: WidenedFit, trials: list[Trial]) -> bo
         return False
     if trials and not trials[0].named and trials[0].explains > state.options.rules.selection.unnamed_ratio * wide.gain:
         return False
-    held_out = state.options.held_out and not state.held.still
-    return not (held_out and state.held.compare(state.fit, wide.fit).refuted)
+    return not state.refutes(wide.fit)
 
 
 def rivals_of_wider(state: Investigation, wide: WidenedFit) -> list[Candidate]:
@@ -148,22 +147,12 @@ def _widened(state: Investigation, index: int) -> Fit | None:
         starts += [along] if along is not None else []
     tried = (try_optimise(problem, start, _FIRST, base.whitener) for start in starts)
     best = min((fit for fit in tried if fit is not None), key=lambda fit: fit.chi_square, default=None)
-    for _ in range(_ROUNDS):
-        if best is None or best.converged:
-            break
-        on = try_optimise(problem, best.point, _MORE, base.whitener)
-        if on is None or on.chi_square >= best.chi_square:
-            break
-        best = on
-    return best
+    return None if best is None else falling(problem, best, _MORE, _ROUNDS)
 
 
 def _judged(state: Investigation, index: int, fit: Fit, quiet: float) -> WidenedFit:
     """Evidence of the wider form over the present fit."""
-    base, rules = state.fit, state.problem.rules.evidence
-    gain = profile_gain(base.residual, fit.residual, len(state.problem.sensors), quiet, rules)
-    fall = base.chi_square - fit.chi_square
-    gain = min(gain, fall)
+    gain, fall = gain_over(state.problem, state.fit, fit, quiet)
     return WidenedFit(fit, index, fall, gain, gain - _cost(state, fit, index))
 
 

@@ -297,12 +297,12 @@ def _converged_fit(problem: Problem, base: Fit, trial: Trial) -> Trial:
 
 def _trial(problem: Problem, base: Fit, candidate: Candidate, fit: Fit, quiet: float | None = None) -> Trial:
     """A fit with its evidence over the base.  quiet: level below which blocks are no evidence; None: by the rules."""
-    gain, reduction = _gain(problem, base, fit, problem.rules.evidence.quiet if quiet is None else quiet)
+    gain, reduction = gain_over(problem, base, fit, problem.rules.evidence.quiet if quiet is None else quiet)
     freedom = len(fit.point.terms[-1].parameters) + len(fit.point.state) - len(base.point.state)
     return Trial(candidate, fit, gain, reduction, gain - cost(fit, problem.rules.evidence), freedom)
 
 
-def _gain(problem: Problem, base: Fit, fit: Fit, quiet: float) -> tuple[float, float]:
+def gain_over(problem: Problem, base: Fit, fit: Fit, quiet: float) -> tuple[float, float]:
     """Twice the log-likelihood ratio of a fit over the base; reduction of chi-square or of unmeasured forces."""
     rules, sensors = problem.rules.evidence, len(problem.sensors)
     if problem.process_noise:  # candidates differ in the noise level of the forces
@@ -318,7 +318,7 @@ def gain_together(problem: Problem, base: Fit, terms: Sequence[Term], iterations
     fit = try_optimise(problem, point, iterations, base.whitener)
     if fit is None:
         return -np.inf
-    gain, _ = _gain(problem, base, fit, problem.rules.evidence.quiet)
+    gain, _ = gain_over(problem, base, fit, problem.rules.evidence.quiet)
     fitted = fit.point.terms[len(base.point.terms) :]
     return gain - sum(float(np.sum(term.prior_deviations**2)) for term in fitted)
 
