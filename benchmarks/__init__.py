@@ -79,6 +79,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "paper": ("sprung.benchmarks.paper", "the paper's systems, baselines and ablations"),
     "paper-cells": ("sprung.benchmarks.rerun_paper", "random figures of docs/paper.md, made again"),
     "paper-compare": ("sprung.benchmarks.paper_report.compare", "two of its methods: ratios, intervals, p"),
+    "paper-keep": ("sprung.benchmarks.paper_report.kept", "rows of the paper's benchmark into docs/paper-rows.zip"),
     "paper-report": ("sprung.benchmarks.paper_report", "rows of the paper's benchmark into docs/paper.md"),
     "physics-overhead": ("sprung.benchmarks.physics_overhead", "what physics in the loop costs a training update"),
 }

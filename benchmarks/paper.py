@@ -22,6 +22,7 @@ from sprung.benchmarks import (
     drifting,
     paper_analysis,
     paper_settings,
+    paper_sources,
     paper_train,
     paper_visual,
     phase_information,
@@ -67,6 +68,10 @@ def run(
     out: folder of checkpoints and pictures; minutes: stop after this long, to be resumed by the same command.
     """
     _check(task, method, budget, device)
+    if seeds < 1 or seed < 0:
+        raise UserError(f"bench paper: --seeds {seeds} --seed {seed}: at least one seed, from 0 on")
+    if minutes is not None and not minutes >= 0:
+        raise UserError(f"bench paper: --minutes {minutes}: give 0 or more")
     torch.set_num_threads(1 if device == "cpu" else torch.get_num_threads())
     until = None if minutes is None else time.monotonic() + 60 * minutes
     for name in [task] if task else TASKS:
@@ -76,7 +81,7 @@ def run(
             settings.folder.mkdir(parents=True, exist_ok=True)
             try:
                 for row in rows(settings):
-                    row |= {"commit": commit(), "sources": paper_settings.sources(), "arithmetic": arithmetic()}
+                    row |= {"commit": commit(), "sources": paper_sources.sources(name), "arithmetic": arithmetic()}
                     _keep(settings, row)
                     yield row
             except OutOfTime as stop:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 from sprung.model.alps.config import Budget
@@ -15,21 +13,6 @@ EXTRA = (
     "autoencoder_plain", "cdm_plain", "alps_plain", "no_opening", "no_affine_head", "all_states_shown", "no_phases",
     "no_tempering", "no_falling_prior", "scales_halved", "scales_doubled", "hamiltonian", "decoder_free",
 )  # fmt: skip
-
-
-_ROOT = Path(__file__).resolve().parent.parent
-_ROWS_OF = ("paper_*", "drifting", "phase_information", "window_information")  # modules beside this one that make rows
-
-
-@cache
-def sources() -> str:
-    """Digest of the code that makes the rows: systems, methods, training, figures.  Rows of other code are stale."""
-    digest = hashlib.sha256()
-    files = [*(_ROOT / "model" / "alps").glob("*.py")]
-    files += [path for name in _ROWS_OF for path in (_ROOT / "benchmarks").glob(f"{name}.py")]
-    for path in sorted(path for path in files if path.stem != "paper_pictures"):
-        digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
 
 
 @dataclass(frozen=True)

@@ -1,39 +1,85 @@
-"""`sprung bench paper-compare TASK`: any two methods, from the errors that `sprung bench paper` keeps.
+"""`sprung bench paper-compare TASK`: any two methods in any figure of the rows that `sprung bench paper` made.
 
-Ratios of means with a bootstrap interval, and p of both tests of `comparisons.py`, as they are: whoever looks at many
-pairs corrects for their number, as the tables of docs/paper.md do.
+SE and PE are compared by trajectory: ratios of means with a bootstrap interval, and p of both tests of
+`comparisons.py`; other figures by seed.  p are as they are: whoever looks at many pairs corrects for their number, as
+the tables of docs/paper.md do.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from sprung.benchmarks.paper_report.comparisons import FIGURES, compare
+from sprung.benchmarks.paper_report.comparisons import FIGURES, compare, p_over_seeds
+from sprung.benchmarks.paper_report.kept import opened
 from sprung.service.errors import UserError
 
 
-def run(task: str, methods: str = "cdm", *, over: str = "alps", data: Path | None = None) -> Iterator[dict[str, Any]]:
-    """One dict per method and figure (SE after the affine map, PE): the ratio, its interval, by seed, p of two tests.
+def run(
+    task: str, methods: str = "cdm", *, over: str = "alps", figure: str | None = None, data: Path | None = None,
+    kept: str = "core",
+) -> Iterator[dict[str, Any]]:  # fmt: skip
+    """One dict per method and figure: the ratio, its interval, by seed, p of two tests.
 
     methods: one or several between commas; over: the method that they are held against;
-    data: folder of the budget, runs/paper/quick by default.
+    figure: any figure of their rows, "PE_noisy"; SE after the affine map and PE by default;
+    data: folder of the budget, "runs/paper/quick"; by default a set of the rows kept in docs/, "core" or "variants".
     """
-    folder = (data or Path("runs/paper/quick")) / "errors"
-    for method in methods.split(","):
-        compared = {figure: compare(folder, task, method, over, figure) for figure in FIGURES}
-        if not any(compared.values()):
-            raise UserError(f"bench paper-compare: {folder}: no errors of {method} and {over} on {task} from one seed")
-        for figure, found in compared.items():
-            if found is not None:
-                yield {
-                    "task": task, "method": method, "over": over, "figure": figure, "seeds": list(found.seeds),
-                    "ratio": _rounded(found.ratio), "interval": [_rounded(found.low), _rounded(found.high)],
-                    "by_seed": [_rounded(ratio) for ratio in found.by_seed],
-                    "p_trajectories": _rounded(found.p),
-                    "p_seeds": None if found.p_seeds is None else _rounded(found.p_seeds),
-                }  # fmt: skip
+    with opened(kept) if data is None else nullcontext(data) as folder:
+        for method in methods.split(","):
+            found = _by_trajectory(folder, task, method, over) if figure is None else []
+            if figure is not None:
+                found = _by_seed(folder, task, method, over, figure)
+            if not found:
+                what = f" with {figure}" if figure else ""
+                raise UserError(
+                    f"bench paper-compare: {data or kept}: no rows of {method} and {over} on {task} from one seed{what}"
+                )
+            for row in found:
+                yield {"task": task, "method": method, "over": over} | row
+
+
+def _by_trajectory(folder: Path, task: str, method: str, over: str) -> list[dict[str, Any]]:
+    compared = {figure: compare(folder / "errors", task, method, over, figure) for figure in FIGURES}
+    return [
+        {
+            "figure": figure, "seeds": list(found.seeds), "ratio": _rounded(found.ratio),
+            "interval": [_rounded(found.low), _rounded(found.high)],
+            "by_seed": [_rounded(ratio) for ratio in found.by_seed], "p_trajectories": _rounded(found.p),
+            "p_seeds": None if found.p_seeds is None else _rounded(found.p_seeds),
+        }
+        for figure, found in compared.items() if found is not None
+    ]  # fmt: skip
+
+
+def _by_seed(folder: Path, task: str, method: str, over: str, figure: str) -> list[dict[str, Any]]:
+    one, other = (_values(folder, task, name, figure) for name in (method, over))
+    seeds = sorted(one.keys() & other.keys())
+    if not seeds:
+        return []
+    above, below = ([values[seed] for seed in seeds] for values in (one, other))
+    ratios = [a / b for a, b in zip(above, below, strict=True) if b]
+    p = p_over_seeds(ratios) if len(ratios) == len(seeds) and min(ratios) > 0 else None
+    return [
+        {
+            "figure": figure, "seeds": seeds, "values": above, "values_over": below,
+            "ratio": _rounded(sum(above) / sum(below)) if sum(below) else None,
+            "by_seed": [_rounded(ratio) for ratio in ratios], "p_seeds": None if p is None else _rounded(p),
+        }
+    ]  # fmt: skip
+
+
+def _values(folder: Path, task: str, method: str, figure: str) -> dict[int, float]:
+    """A figure of a method's rows by seed."""
+    found = {}
+    for path in sorted((folder / "rows").glob(f"{task}-{method}-s*.json")):
+        row = json.loads(path.read_text())
+        if isinstance(row.get(figure), (int, float)):
+            found[int(row["seed"])] = row[figure]
+    return found
 
 
 def _rounded(value: float) -> float:

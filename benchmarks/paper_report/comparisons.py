@@ -96,7 +96,7 @@ def _errors(folder: Path, task: str, method: str) -> dict[int, TrajectoryErrors]
     found = {}
     for path in sorted(folder.glob(f"{task}-{method}-s*.npz")):
         with np.load(path) as kept:
-            found[int(path.stem.rpartition("-s")[2])] = {key: kept[key] for key in kept.files}
+            found[int(path.stem.rpartition("-s")[2])] = {key: kept[key].astype(float) for key in kept.files}
     return found
 
 
@@ -126,11 +126,11 @@ def _compared(
         high=float(high),
         by_seed=tuple(float(np.mean(a) / np.mean(b)) for a, b in pairs),
         p=float(stats.wilcoxon(left, right).pvalue) if np.any(left != right) else 1.0,
-        p_seeds=_over_seeds([float(np.mean(a) / np.mean(b)) for a, b in pairs]),
+        p_seeds=p_over_seeds([float(np.mean(a) / np.mean(b)) for a, b in pairs]),
     )
 
 
-def _over_seeds(ratios: Sequence[float]) -> float | None:
+def p_over_seeds(ratios: Sequence[float]) -> float | None:
     """p of Student's test that the logarithm of a ratio has the mean zero over seeds."""
     logarithms = np.log(ratios)
     if len(ratios) < 2 or np.ptp(logarithms) == 0:

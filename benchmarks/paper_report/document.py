@@ -9,39 +9,26 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed, comparisons_of_pairs
 from sprung.benchmarks.paper_report.tables import name_of, seeds_of, table
 from sprung.benchmarks.paper_report.targets import targets
-from sprung.benchmarks.paper_settings import EXTRA, sources
-from sprung.service.errors import UserError
+from sprung.benchmarks.paper_settings import EXTRA
+from sprung.benchmarks.paper_sources import is_current
 
 PLACE = re.compile(r"<!-- (?P<kind>\w+)(?: (?P<task>\w+))? -->(?P<before>.*?)<!-- end -->", re.DOTALL)
 VARIANTS = ("alps", *EXTRA)  # beside ALPS: as printed, a departure left out, newer methods
 Rows = list[dict[str, Any]]
 
 
-def run(data: Path | None = None, document: Path | None = None, *, only: str | None = None) -> Iterator[dict[str, Any]]:
-    """One dict per place of the document that was written: its marker, how many rows, their seeds, whether it changed.
-
-    data: folder of the budget, runs/paper/quick by default; document: docs/paper.md by default;
-    only: kinds of places, or single ones ("variants", "variants pendulum"), several between commas; no pictures then.
-    """
-    places = None if only is None else [part.strip() for part in only.split(",")]
-    try:
-        yield from refresh(data or Path("runs/paper/quick"), document or Path("docs/paper.md"), places)
-    except (ValueError, OSError) as error:
-        raise UserError(f"bench paper-report: {error}") from error
-
-
 def read_rows(folder: Path) -> Rows:
     """Rows that were kept.  Errors: `ValueError` naming those that other code made than what stands here."""
     found = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob("*.json"))]
     found = [row for row in found if "unfinished" not in row]
-    stale = sorted({f"{row['task']} {name_of(row)}" for row in found if row.get("sources") != sources()})
+    stale = sorted({f"{row['task']} {name_of(row)}" for row in found if not is_current(row)})
     if stale:
         raise ValueError(f"{folder}: rows of other code than this: {', '.join(stale)}; run them again or remove them")
     return found

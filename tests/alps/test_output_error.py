@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from sprung.benchmarks import paper, paper_report, paper_settings
+from sprung.benchmarks import paper, paper_report, paper_settings, paper_sources
 from sprung.model.alps import mass_spring_damper, metrics, output_error, pendulum, two_body
 from sprung.model.alps.fit import Split
 from sprung.model.alps.task import WINDOW, Task
@@ -88,7 +88,13 @@ def test_comparisons_are_paired_and_separate_the_better_from_the_equal(tmp_path:
 def test_rows_of_other_code_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "rows"
     folder.mkdir()
-    row = {"task": "pendulum", "method": "alps", "SE": 1.0, "sources": paper_settings.sources(), "commit": "abc"}
+    row = {
+        "task": "pendulum",
+        "method": "alps",
+        "SE": 1.0,
+        "sources": paper_sources.sources("pendulum"),
+        "commit": "abc",
+    }
     (folder / "a.json").write_text(json.dumps(row))
     assert paper_report.read_rows(tmp_path) == [row]
     (folder / "b.json").write_text(json.dumps(row | {"method": "cdm", "sources": "older"}))
@@ -107,5 +113,5 @@ def test_several_methods_may_be_asked_for_at_once(tmp_path: Path) -> None:
 
 
 def test_rows_say_what_made_them() -> None:
-    assert len(paper_settings.sources()) == 12
+    assert len(paper_sources.sources("pendulum")) == 12
     assert paper.commit()

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks import paper_report, rerun_paper
-from sprung.benchmarks.paper_report import compare
+from sprung.benchmarks.paper_report import compare, document, kept
 from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed, comparisons_of_pairs
-from sprung.benchmarks.paper_settings import sources
+from sprung.benchmarks.paper_sources import sources
 from sprung.service.errors import UserError
 
 PAGE = """# Page
@@ -30,7 +30,13 @@ as it was
 
 def keep(folder: Path, method: str, seed: int, **figures: Any) -> None:
     (folder / "rows").mkdir(exist_ok=True)
-    row = {"task": "pendulum", "method": method, "seed": seed, "commit": "abc", "sources": sources()} | figures
+    row = {
+        "task": "pendulum",
+        "method": method,
+        "seed": seed,
+        "commit": "abc",
+        "sources": sources("pendulum"),
+    } | figures
     (folder / "rows" / f"pendulum-{method}-s{seed}.json").write_text(json.dumps(row))
 
 
@@ -129,7 +135,7 @@ def test_any_two_methods_can_be_held_against_each_other(tmp_path: Path) -> None:
     assert row["p_trajectories"] < 1e-20 and row["p_seeds"] < 0.01
     (said,) = comparisons_of_pairs("pendulum", tmp_path / "errors").splitlines()[2:]
     assert said.startswith(f"| cdm_plain | cdm | SE | {row['ratio']:.3g} (")
-    with pytest.raises(UserError, match="no errors of zero and cdm on pendulum"):
+    with pytest.raises(UserError, match="no rows of zero and cdm on pendulum from one seed"):
         list(compare.run("pendulum", "zero", over="cdm", data=tmp_path))
 
 
@@ -141,3 +147,49 @@ def test_tables_say_which_seeds_have_other_arithmetic(tmp_path: Path) -> None:
     paper_report.refresh(tmp_path, document, ["rows"])
     assert "Made at `abc`, seeds 0, 1, 2; AVX2 (seeds 0, 1); AVX512 (seed 2)." in document.read_text()
     assert {cell.seeds for cell in rerun_paper.stated(document.read_text())} == {(0, 1, 2)}
+
+
+def test_any_figure_of_the_rows_is_compared_by_seed(tmp_path: Path) -> None:
+    for seed in range(3):
+        keep(tmp_path, "alps", seed, PE_noisy=0.02 * (seed + 1))
+        keep(tmp_path, "output_error", seed, PE_noisy=(2 + 0.1 * seed) * 0.02 * (seed + 1))
+    keep(tmp_path, "output_error", 3, PE_noisy=1.0)  # of a seed that the other has not
+    (row,) = compare.run("pendulum", "output_error", figure="PE_noisy", data=tmp_path)
+    assert row["seeds"] == [0, 1, 2] and row["by_seed"] == [2, 2.1, 2.2] and row["p_seeds"] < 0.01
+    assert row["values_over"] == [0.02, 0.04, 0.06]
+    with pytest.raises(UserError, match="no rows of output_error and alps on pendulum from one seed with OE"):
+        list(compare.run("pendulum", "output_error", figure="OE", data=tmp_path))
+
+
+def test_rows_that_are_kept_are_compared_as_those_that_were_made(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    for seed in range(2):
+        keep(tmp_path, "alps", seed, SE=1.0)
+        keep(tmp_path, "cdm", seed, SE=2.0)
+        keep_errors(tmp_path, "alps", seed, SE=rng.uniform(1, 2, 50))
+        keep_errors(tmp_path, "cdm", seed, SE=rng.uniform(2, 4, 50))
+    archive = tmp_path / "rows.zip"
+    (told,) = kept.run("core", tmp_path, methods="cdm", archive=archive)
+    assert told == {"kept": "core", "task": "pendulum", "method": "cdm", "seeds": [0, 1]}
+    list(kept.run("core", tmp_path, methods="alps", archive=archive))  # beside what is there
+    before = archive.read_bytes()
+    list(kept.run("core", tmp_path, archive=archive))
+    assert archive.read_bytes() == before
+    with kept.opened("core", archive) as folder:
+        (again,) = compare.run("pendulum", "cdm", data=folder)
+    assert again == next(compare.run("pendulum", "cdm", data=tmp_path))
+    with pytest.raises(UserError, match="no rows 'variants'; it has core"), kept.opened("variants", archive):
+        pass
+    with pytest.raises(UserError, match="no set 'cores'"):
+        next(kept.run("cores", tmp_path, archive=archive))
+    with pytest.raises(UserError, match="no rows of zero"):
+        next(kept.run("core", tmp_path, methods="zero", archive=archive))
+
+
+def test_tables_of_the_page_are_those_of_the_kept_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(document, "is_current", lambda row: True)  # the page says what made its rows
+    page = kept.ARCHIVE.parent / "paper.md"
+    copy = tmp_path / "paper.md"
+    copy.write_text(page.read_text())
+    told = list(paper_report.run(None, copy))
+    assert len(told) > 10 and [row["place"] for row in told if row["changed"]] == []
