@@ -54,12 +54,16 @@ def run(
     count: cells; seed: of the choice, new ones every time by default; task: only of one; document: another page.
     """
     place = document or DOCUMENT
+    if count < 1 or (seed is not None and seed < 0):
+        raise UserError(f"bench paper-cells: {count} cells, --seed {seed}: at least one cell, seeds from 0 on")
     try:
         cells = [cell for cell in stated(place.read_text()) if task in (None, cell.task)]
     except OSError as error:
         raise UserError(f"bench paper-cells: {place}: {error.strerror}") from error
     if not cells:
-        raise UserError(f"bench paper-cells: {place}: no figures that say from which seeds they are")
+        raise UserError(
+            f"bench paper-cells: {place}: no figures{f' of {task}' if task else ''} that say from which seeds they are"
+        )
     chosen = np.random.default_rng(seed).permutation(len(cells))[:count]
     for cell in (cells[i] for i in chosen):
         again = _again(cell)

@@ -15,19 +15,23 @@ from typing import Any
 
 from sprung.benchmarks.paper_report.comparisons import FIGURES, compare, p_over_seeds
 from sprung.benchmarks.paper_report.kept import opened
+from sprung.benchmarks.paper_sources import MADE_BY
 from sprung.service.errors import UserError
 
 
 def run(
-    task: str, methods: str = "cdm", *, over: str = "alps", figure: str | None = None, data: Path | None = None,
+    task: str = "", methods: str = "cdm", *, over: str = "alps", figure: str | None = None, data: Path | None = None,
     kept: str = "core",
 ) -> Iterator[dict[str, Any]]:  # fmt: skip
     """One dict per method and figure: the ratio, its interval, by seed, p of two tests.
 
+    task: one that has methods to compare, "pendulum";
     methods: one or several between commas; over: the method that they are held against;
     figure: any figure of their rows, "PE_noisy"; SE after the affine map and PE by default;
     data: folder of the budget, "runs/paper/quick"; by default a set of the rows kept in docs/, "core" or "variants".
     """
+    if task not in MADE_BY:
+        raise UserError(f"bench paper-compare: no task {task!r}; known are {', '.join(MADE_BY)}")
     with opened(kept) if data is None else nullcontext(data) as folder:
         for method in methods.split(","):
             found = _by_trajectory(folder, task, method, over) if figure is None else []

@@ -45,13 +45,17 @@ def opened(kept: str, archive: Path | None = None) -> Iterator[Path]:
         yield Path(folder) / kept
 
 
-def run(kept: str, data: Path, *, methods: str | None = None, archive: Path | None = None) -> Iterator[dict[str, Any]]:
+def run(
+    kept: str = "core", data: Path | None = None, *, methods: str | None = None, archive: Path | None = None
+) -> Iterator[dict[str, Any]]:
     """One dict per task and method whose rows of `data` were put into the archive.
 
-    kept: the set; data: folder of the budget, "runs/paper/quick"; methods: several between commas, all by default.
+    kept: the set; data: folder of the budget, runs/paper/quick by default;
+    methods: several between commas, all by default.
     """
     if kept not in SETS:
         raise UserError(f"bench paper-keep: no set {kept!r}; known are {', '.join(SETS)}")
+    data = data or Path("runs/paper/quick")
     try:
         rows = read_rows(data)
     except (ValueError, OSError) as error:

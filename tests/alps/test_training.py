@@ -66,14 +66,18 @@ def fake_split() -> Split:
     return Split(rollouts, task.to_chart(rollouts.states, task.placed).float() @ mix)
 
 
-def test_an_interrupted_run_ends_in_the_same_weights(tmp_path: Path) -> None:
-    task, data = two_body.TASK, fake_split()
+@pytest.mark.parametrize("end_to_end", [False, True])
+def test_an_interrupted_run_ends_in_the_same_weights(tmp_path: Path, end_to_end: bool) -> None:
+    task, data, config = two_body.TASK, fake_split(), replace(TINY, end_to_end=end_to_end)
+    torch.manual_seed(0)
+    frames = FrameAutoencoder(SIZES)
+    first = next(frames.embed.maps.parameters()).detach().clone()
 
     def trained(folder: Path) -> list[torch.Tensor]:
         folder.mkdir(exist_ok=True)
-        frames = FrameAutoencoder(SIZES)
-        model = fit.train_method(task, "alps", data, frames, TINY, SIZES, folder, TimeLimit())
-        return [p.detach().clone() for p in model.network.parameters()]
+        model = fit.train_method(task, "alps", data, frames, config, SIZES, folder, TimeLimit())
+        assert torch.equal(next(model.frames.embed.maps.parameters()), first) is not end_to_end
+        return [p.detach().clone() for p in model.parameters()]
 
     straight = trained(tmp_path / "straight")
     folder = tmp_path / "broken"
@@ -86,7 +90,7 @@ def test_an_interrupted_run_ends_in_the_same_weights(tmp_path: Path) -> None:
                 raise OutOfTime("stopped")
 
     with pytest.raises(OutOfTime):
-        fit.train_method(task, "alps", data, FrameAutoencoder(SIZES), TINY, SIZES, folder, Stops())
+        fit.train_method(task, "alps", data, frames, config, SIZES, folder, Stops())
     for left, right in zip(straight, trained(folder), strict=True):
         torch.testing.assert_close(left, right)
 

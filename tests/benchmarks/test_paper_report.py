@@ -83,6 +83,8 @@ def test_only_the_places_that_are_named_are_written(tmp_path: Path) -> None:
     (told,) = paper_report.run(tmp_path, document, only="variants pendulum")
     assert told == {"place": "variants pendulum", "rows": 1, "seeds": "0", "changed": True}
     assert "<!-- rows pendulum -->\n<!-- end -->" in document.read_text()
+    with pytest.raises(UserError, match="no rows for any place of variants train"):
+        list(paper_report.run(tmp_path, document, only="variants train"))
 
 
 def test_rows_of_other_code_are_refused(tmp_path: Path) -> None:

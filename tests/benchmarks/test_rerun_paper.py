@@ -65,5 +65,9 @@ def test_a_figure_of_several_seeds_may_vary_as_they_do() -> None:
 
 def test_a_page_without_such_figures_is_said(tmp_path: Path) -> None:
     (tmp_path / "page.md").write_text("nothing")
-    with pytest.raises(UserError, match="no figures"):
+    with pytest.raises(UserError, match="no figures that"):
         list(rerun_paper.run(document=tmp_path / "page.md"))
+    with pytest.raises(UserError, match="no figures of train that"):
+        list(rerun_paper.run(task="train", document=tmp_path / "page.md"))
+    with pytest.raises(UserError, match="0 cells"):
+        list(rerun_paper.run(0))
