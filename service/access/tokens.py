@@ -96,8 +96,9 @@ class Tokens:
         self._forget()
         return text, row
 
-    def rotate(self, token_id: str, hours: float = 24.0, by: str = "local") -> tuple[str, TokenRow]:
-        """A new token like an old one, which ends in `hours`.
+    def rotate(self, token_id: str, hours: float = 24.0, by: str = "local") -> tuple[str, TokenRow, int]:
+        """A new token like an old one, which ends in `hours`, if it does not end before; its text, its row, and when
+        the old one ends, ns.
 
         Raises NotFound, and UserError for an old one that is worth nothing any more: it would come to life again.
         """
@@ -111,9 +112,9 @@ class Tokens:
         left = None if old.expires_ns is None else max((old.expires_ns - old.created_ns) / DAY, 1e-6)
         text, row = self.create(old.name, old.scopes, old.fleet, left, by)
         with self._store.write() as connection:
-            tokens.expire(connection, token_id, now + round(hours * 3600 * NANOSECONDS))
+            ends = tokens.expire(connection, token_id, now + round(hours * 3600 * NANOSECONDS))
         self._forget()
-        return text, row
+        return text, row, ends
 
     def revoke(self, token_id: str, by: str = "local") -> None:
         """Make a token worthless.  Raises NotFound."""

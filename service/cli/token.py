@@ -39,11 +39,11 @@ def rotate(token_id: str, hours: float, store: str | None) -> int:
     """Make a token like an old one, and let that end."""
     with opened(store) as tokens:
         try:
-            text, row = tokens.rotate(token_id, hours)
+            text, row, ends = tokens.rotate(token_id, hours)
         except LookupError as error:
             raise UserError(str(error)) from None
     print(text)
-    print(f"token {row.id} takes the place of {token_id}, which ends in {hours:g} h", file=sys.stderr)
+    print(f"token {row.id} takes the place of {token_id}, which ends {to_iso(ends)}", file=sys.stderr)
     return 0
 
 

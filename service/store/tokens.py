@@ -51,8 +51,10 @@ def revoke(connection: Connection, token_id: str, now: int) -> bool:
     return connection.execute(query).rowcount > 0
 
 
-def expire(connection: Connection, token_id: str, at: int) -> None:
-    """Let a token end at a time, if it does not end before."""
+def expire(connection: Connection, token_id: str, at: int) -> int:
+    """Let a token end at a time, if it does not end before; when it ends, ns."""
     row = get(connection, token_id)
-    if row is not None and (row.expires_ns is None or row.expires_ns > at):
-        connection.execute(update(tokens).where(tokens.c.id == token_id).values(expires_ns=at))
+    if row is not None and row.expires_ns is not None and row.expires_ns <= at:
+        return row.expires_ns
+    connection.execute(update(tokens).where(tokens.c.id == token_id).values(expires_ns=at))
+    return at

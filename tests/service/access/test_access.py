@@ -233,7 +233,8 @@ def test_a_token_is_rotated_and_the_old_one_ends(store: Store) -> None:
     now = time.time_ns()
     found = Tokens(store, clock=lambda: now)
     text, row = found.create("feeder", ["ingest"], fleet="a-", days=10)
-    new, fresh = found.rotate(row.id, hours=1)
+    new, fresh, ends = found.rotate(row.id, hours=1)
+    assert ends == now + 3600 * 10**9
     assert found.actor(text) and found.actor(new).scopes == {"ingest"}
     assert (fresh.name, fresh.fleet, fresh.expires_ns) == ("feeder", "a-", now + 10 * DAY)
     now += 2 * 3600 * 10**9
@@ -241,6 +242,13 @@ def test_a_token_is_rotated_and_the_old_one_ends(store: Store) -> None:
     with pytest.raises(Refused, match="expired"):
         found.actor(text)
     assert found.actor(new).name == "feeder"
+
+
+def test_a_token_that_is_rotated_ends_no_later_than_it_would_have(store: Store) -> None:
+    now = time.time_ns()
+    found = Tokens(store, clock=lambda: now)
+    _, row = found.create("feeder", ["ingest"], days=0.5)
+    assert found.rotate(row.id, hours=24)[2] == row.expires_ns
 
 
 def test_a_token_that_is_worth_nothing_is_not_rotated(store: Store) -> None:
