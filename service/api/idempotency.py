@@ -3,7 +3,8 @@
 As in the draft of the IETF (draft-ietf-httpapi-idempotency-key-header): the first answer is kept for a day and given
 again; the same key for another request is refused, and so is one whose first request is still being worked on.  A
 request is its method, path and body; of an upload, the file, its name and the other fields count.  Keys of callers that
-differ in name, fleet or scopes have nothing to do with each other.
+differ in name, fleet or scopes have nothing to do with each other.  Answers age by the clock of retention, which takes
+no leap of the host's.
 """
 
 from __future__ import annotations
@@ -26,11 +27,12 @@ from sprung.service.api.problems import ApiProblem
 from sprung.service.api.scopes import FORM, content_kind
 from sprung.service.api.uploads import identity_of
 from sprung.service.core import Core
+from sprung.service.housekeeping import LONGEST_PAUSE
 from sprung.service.store.engine import insert_or_ignore
 from sprung.service.store.schema import idempotency
-from sprung.service.times import NANOSECONDS, now_ns
+from sprung.service.times import NANOSECONDS
 
-KEPT = 86_400 * NANOSECONDS
+KEPT = LONGEST_PAUSE + 86_400 * NANOSECONDS  # a day, though the host's clock leaps while the service is stopped
 Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=200, description="sent twice, carried out once")]
 _running: set[str] = set()
 _lock = threading.Lock()
@@ -73,9 +75,9 @@ class IdempotentRequests:
                 _running.discard(self._key)
 
     def _find(self) -> Row[Any] | None:
-        table = idempotency
+        table, now = idempotency, self._core.housekeeping.clock.now(keep=False)
         with self._core.store.write() as connection:
-            connection.execute(delete(table).where(table.c.created_ns < now_ns() - KEPT))
+            connection.execute(delete(table).where(table.c.created_ns < now - KEPT))
             return connection.execute(select(table).where(table.c.key == self._key)).first()
 
     async def _again(self, kept: Row[Any]) -> Response:
@@ -94,7 +96,7 @@ class IdempotentRequests:
             "status": response.status_code,
             "body": json.loads(bytes(response.body)),
             "location": response.headers.get("location"),
-            "created_ns": now_ns(),
+            "created_ns": self._core.housekeeping.clock.now(keep=False),
         }
         with self._core.store.write() as connection:
             insert_or_ignore(connection, idempotency, [row])

@@ -20,12 +20,14 @@ from sprung.model.system import System, parse_system
 from sprung.service.api import signals
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
+from sprung.service.housekeeping import DAY
 from sprung.service.monitoring.engine import Engine
 from sprung.service.rendering.drawing import Mark, columns, plan_view, side_view, small_view
 from sprung.service.settings import Settings
 from sprung.service.store import outbox, retention, work
 from sprung.service.store.schema import audit, metadata
 from sprung.service.times import from_iso
+from tests.clocks import Clocks
 from tests.service_fakes import REPORT, START, FakeIdentifier, make_window
 
 
@@ -98,6 +100,31 @@ def test_the_same_key_does_the_same_thing_once(client: TestClient, broken: str) 
     jobs = [client.post("/recordings", files=files, headers={"Idempotency-Key": "k2"}).json()["id"] for _ in "ab"]
     assert jobs[0] == jobs[1]
     assert len(client.get("/jobs").json()["jobs"]) == 1
+
+
+def test_a_key_outlives_a_leap_of_the_hosts_clock_also_while_the_service_is_stopped(
+    client: TestClient, core: Core, broken: str, tmp_path: Path
+) -> None:
+    clocks = Clocks(START)
+
+    def send() -> httpx2.Response:
+        return client.post("/vehicles/a/notes", json={"text": "seen"}, headers={"Idempotency-Key": "k"})
+
+    def start_anew() -> None:
+        core.housekeeping.clock = clocks.retention(tmp_path / "clock.json")
+        core.housekeeping.clock.now()
+
+    start_anew()
+    assert "idempotency-replayed" not in send().headers
+    clocks.passed(3600, leap=400 * DAY)
+    assert send().headers["idempotency-replayed"] == "true"
+    clocks.passed(3600, leap=-400 * DAY)
+    core.housekeeping.clock.now()
+    clocks.passed(60, leap=40 * DAY)
+    start_anew()
+    assert send().headers["idempotency-replayed"] == "true"
+    clocks.passed(2 * 86_400)
+    assert "idempotency-replayed" not in send().headers
 
 
 @pytest.mark.parametrize("path", ["/recordings", "/diagnose"])

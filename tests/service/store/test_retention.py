@@ -10,13 +10,14 @@ from sqlalchemy import func, select
 
 from sprung.model.system import System
 from sprung.service.cli import retention as retention_command
-from sprung.service.housekeeping import DAY, Housekeeping, RetentionClock
+from sprung.service.housekeeping import DAY, Housekeeping
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
 from sprung.service.store import Store, retention, work
 from sprung.service.store.schema import windows
+from tests.clocks import Clocks
 from tests.service_fakes import START, make_window
 
 HOUR = DAY // 24
@@ -30,20 +31,6 @@ def stored(store: Store) -> int:
 def fill(engine: Engine, store: Store, compute: Compute, system: System, at: int, first: int = 0) -> None:
     pipeline = Pipeline(engine, store, compute, clock=lambda: at)
     pipeline.process("a", [make_window(system, first + i) for i in range(20)])
-
-
-class Clocks:
-    """A host's clocks."""
-
-    def __init__(self, wall: int) -> None:
-        self.wall, self.monotonic = wall, 5
-
-    def passed(self, seconds: float, leap: int = 0) -> None:
-        self.wall += round(seconds * 1e9) + leap
-        self.monotonic += round(seconds * 1e9)
-
-    def retention(self, path: Path, newest: int | None = None) -> RetentionClock:
-        return RetentionClock(path, lambda: newest, lambda: self.wall, lambda: self.monotonic)
 
 
 def test_a_clock_that_cannot_be_written_down_goes_on_all_the_same(tmp_path: Path) -> None:
