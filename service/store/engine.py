@@ -18,7 +18,7 @@ from alembic import command
 from alembic.config import Config
 from alembic.util import CommandError
 from pydantic_core import to_json
-from sqlalchemy import URL, Connection, Engine, Table, create_engine, event, text
+from sqlalchemy import URL, Connection, Engine, Table, create_engine, event, inspect, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import ExceptionContext, make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
@@ -32,6 +32,7 @@ MOST_WRITERS = 10  # transactions of one process at once on PostgreSQL; others w
 MIGRATING = 0x5B_70_72_74  # of the advisory lock
 STATEMENT_MILLISECONDS = 60_000  # a statement that takes longer is given up: its caller tries again
 UPSERT_DIALECTS = ("sqlite", "postgresql")
+VERSIONS = "alembic_version"  # the table that every store of Sprung's has
 
 
 class Store:
@@ -128,16 +129,29 @@ def open_store(url: str, migrated: bool = False) -> Store:
 
 
 def migrate(store: Store) -> None:
-    """Bring the schema to the newest revision; nothing happens when it is there already."""
+    """Bring the schema to the newest revision; nothing happens when it is there already.
+
+    Raises UserError for a file that is another program's.
+    """
     config = Config()
     config.set_main_option("script_location", "sprung.service:migrations")
     config.set_main_option("path_separator", "os")
     with store.write() as connection:
+        if connection.dialect.name == "sqlite":
+            _refuse_foreign(connection)
         if store.many_writers:  # processes that start together migrate one after the other, however long it takes
             connection.execute(text("SET LOCAL statement_timeout = 0"))
             connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": MIGRATING})
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
+
+
+def _refuse_foreign(connection: Connection) -> None:
+    """Raise UserError for a file that is another program's."""
+    tables = set(inspect(connection).get_table_names())
+    if tables and VERSIONS not in tables:
+        name = connection.engine.url.database
+        raise UserError(f"store {name}: a database of another program (it has a table {min(tables)!r}); choose another")
 
 
 def insert_or_ignore(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) -> None:
