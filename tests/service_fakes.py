@@ -83,6 +83,17 @@ class FakeExaminer(FakeIdentifier):
         return [replace(estimate, faults=self.faults) for estimate in self.identify(windows)]
 
 
+@dataclass
+class BelievingExaminer(FakeExaminer):
+    """As that; faults that are known change what it finds beside."""
+
+    def examine(
+        self, windows: FloatArray, weigh: BoolArray, known: Sequence[tuple[MeasurementFault, ...]] = ()
+    ) -> list[Estimate]:
+        found = super().examine(windows, weigh, known)
+        return [replace(one, log_ratio=one.log_ratio + 0.01 * len(k)) for one, k in zip(found, known, strict=True)]
+
+
 def make_window(system: System, number: int, level: float = 0.0, outcome: str = "used") -> Window:
     """Window `number` of a vehicle whose parameters are all exp(level) times nominal, as the fake reads it."""
     values = np.full((system.window, len(system.channels)), level)

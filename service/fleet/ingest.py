@@ -70,7 +70,8 @@ class Ingest:
                         held[message.vehicle] = changed.after
                         folded.append(changed)
         self._settle(folded)
-        return [taken[i] for i in range(len(messages))]
+        faults = {vehicle: at.known_faults() for vehicle, at in held.items()}
+        return [replace(taken[i], faults=faults[message.vehicle]) for i, message in enumerate(messages)]
 
     def start(self) -> None:
         """Sweep from time to time, in a thread."""

@@ -100,6 +100,7 @@ class IngestResult:
     folded: int  # windows that were tracked or counted now
     waiting: int  # of the message, kept until the gap before them is filled or given up
     known: int  # that were there before
+    faults: tuple[MeasurementFault, ...] = ()  # of the vehicle's measurements, as its tracker knows them by now
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from sprung.model.signals import Estimate, FloatArray
+from sprung.model.signals import Estimate, FloatArray, MeasurementFault
 from sprung.service.errors import Busy, UserError
 from sprung.service.fleet.message import IngestResult, Message, SentWindows, WindowEstimate, read_messages
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.monitoring.form import WindowForm
+
+MOST_FAULTY = 10_000  # vehicles whose faults are held; one that is heard from again is told anew with its first window
 
 
 class RayBehind:
@@ -25,6 +28,7 @@ class RayBehind:
         self._identify = identify
         self._fold = fold
         self._form: WindowForm | None = None
+        self._faults: OrderedDict[str, tuple[MeasurementFault, ...]] = OrderedDict()  # where there are any
         self._waiting, self._most = 0, sizes.queued * sizes.replicas
         # one more than there are replicas, so that none waits for the next; more, and batches stay small
         wait = {"batch_wait_timeout_s": sizes.batch_wait_seconds, "max_concurrent_batches": sizes.replicas + 1}
@@ -45,7 +49,8 @@ class RayBehind:
     async def identify_and_fold(self, sent: SentWindows) -> IngestResult:
         """Identify windows, together with those of others, and fold them together."""
         with self._place():
-            ways = [self._identified(one) for one in zip(sent.starts, sent.values, strict=True)]
+            known = self._faults.get(sent.vehicle, ())
+            ways = [self._identified((*one, known)) for one in zip(sent.starts, sent.values, strict=True)]
             estimates: list[Estimate] = await asyncio.gather(*ways)
             found = zip(sent.starts, estimates, strict=True)
             windows = tuple(WindowEstimate(start, "used", None, 0, False, estimate) for start, estimate in found)
@@ -66,11 +71,24 @@ class RayBehind:
         taken: IngestResult | UserError = await self._folded(message)
         if isinstance(taken, UserError):
             raise taken
+        self._learn(taken)
         return taken
 
-    async def _identify_together(self, asked: list[tuple[int, FloatArray]]) -> list[Estimate]:
-        starts, values = [start for start, _ in asked], np.stack([values for _, values in asked])
-        found: list[Estimate] = await _asked(self._identify.identify.remote(starts, values))
+    def _learn(self, taken: IngestResult) -> None:
+        """What is wrong with a vehicle's sensors, for its next windows."""
+        self._faults.pop(taken.vehicle, None)
+        if taken.faults:
+            self._faults[taken.vehicle] = taken.faults
+            if len(self._faults) > MOST_FAULTY:
+                self._faults.popitem(last=False)
+
+    async def _identify_together(
+        self, asked: list[tuple[int, FloatArray, tuple[MeasurementFault, ...]]]
+    ) -> list[Estimate]:
+        starts, values, known = zip(*asked, strict=True)
+        found: list[Estimate] = await _asked(
+            self._identify.identify.remote(list(starts), np.stack(values), list(known))
+        )
         return found
 
     async def _fold_together(self, messages: list[Message]) -> list[IngestResult | UserError]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 
-from sprung.model.signals import Estimate, FloatArray
+from sprung.model.signals import Estimate, FloatArray, MeasurementFault
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import IngestResult, Message
 from sprung.service.monitoring.form import WindowForm
@@ -31,9 +31,12 @@ class IdentifyReplica:
         """What windows have to look like."""
         return self._engine.form
 
-    async def identify(self, starts: list[int], values: FloatArray) -> list[Estimate]:
-        """The estimates of windows, values (B, T, C)."""
-        return (await asyncio.to_thread(self._engine.identify, values, starts=starts))[0]
+    async def identify(
+        self, starts: list[int], values: FloatArray, known: list[tuple[MeasurementFault, ...]]
+    ) -> list[Estimate]:
+        """The estimates of windows, values (B, T, C); known: faults of each one's vehicle, as `Engine.identify` has
+        them."""
+        return (await asyncio.to_thread(self._engine.identify, values, starts=starts, known=known))[0]
 
 
 class FoldReplica:

@@ -154,7 +154,7 @@ class Pipeline:
         """Of a vehicle's measurements, as far as its tracker is in memory; see `Engine.identify`."""
         with self._lock:
             held = self._vehicles.get(vehicle)
-        return () if held is None or held.served is not served else served.engine.tracker.known_faults(held.state)
+        return () if held is None or held.served is not served else held.known_faults()
 
     def knows_faults(self, vehicle: str) -> bool:
         """Whether the vehicle's tracker in memory knows of any: they change a little with every batch, so that windows
@@ -242,7 +242,7 @@ class Pipeline:
         if served is not None and served.model_id != at.served.model_id:
             raise ModelChanged(vehicle)
         if faults is not None and any(estimate is not None for estimate in estimates):
-            now = at.served.engine.tracker.known_faults(at.state)
+            now = at.known_faults()
             if now != faults:
                 raise FaultsChanged(now)
         # another process may have stored some of them while this one was identifying

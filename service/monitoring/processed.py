@@ -76,6 +76,10 @@ class HeldVehicle:
     state: TrackerState
     newest_ns: int | None = None  # start of the newest window that is stored; None: nobody has looked
 
+    def known_faults(self) -> tuple[MeasurementFault, ...]:
+        """Of the vehicle's measurements: see `Engine.identify`."""
+        return self.served.engine.tracker.known_faults(self.state)
+
     def with_stored(self, starts: Iterable[int]) -> HeldVehicle:
         """One revision later, with windows stored that start then."""
         newest = None if self.newest_ns is None else max(self.newest_ns, *starts)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select
 
-from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System
 from sprung.replay.writing import write_recording
 from sprung.service.errors import UserError
@@ -28,7 +26,7 @@ from sprung.service.sources.reading import ReadRequest, reading_of
 from sprung.service.store import Store, fleet, history, open_store, status
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.schema import alarms, models, windows
-from tests.service_fakes import FakeExaminer
+from tests.service_fakes import BelievingExaminer
 
 START = 1_790_000_000_000_000_000
 SECONDS = 12
@@ -132,23 +130,15 @@ def test_a_backfill_equals_replaying_in_order_of_time(
 
 
 @pytest.fixture
-def examiner(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> FakeExaminer:
+def examiner(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> BelievingExaminer:
     """Finds a fault in every window; faults that are known change what it finds."""
-
-    class Believing(FakeExaminer):
-        def examine(
-            self, windows: FloatArray, weigh: BoolArray, known: Sequence[tuple[MeasurementFault, ...]] = ()
-        ) -> list[Estimate]:
-            found = super().examine(windows, weigh, known)
-            return [replace(one, log_ratio=one.log_ratio + 0.01 * len(k)) for one, k in zip(found, known, strict=True)]
-
-    made = Believing(engine.system)
+    made = BelievingExaminer(engine.system)
     monkeypatch.setattr(module, "engine_of", lambda settings: replace(engine, identifier=made))
     return made
 
 
 def test_a_backfill_equals_replaying_where_a_sensor_is_faulty(
-    plan: BackfillPlan, place: Path, engine: Engine, any_store: Store, tmp_path: Path, examiner: FakeExaminer
+    plan: BackfillPlan, place: Path, engine: Engine, any_store: Store, tmp_path: Path, examiner: BelievingExaminer
 ) -> None:
     backfill(plan, HereTasks(), 2, shown)
     assert examiner.faults in examiner.told and () in examiner.told
@@ -158,7 +148,7 @@ def test_a_backfill_equals_replaying_where_a_sensor_is_faulty(
 
 
 def test_a_recording_that_goes_away_before_it_is_read_again_is_reported_of(
-    plan: BackfillPlan, place: Path, examiner: FakeExaminer, monkeypatch: pytest.MonkeyPatch
+    plan: BackfillPlan, place: Path, examiner: BelievingExaminer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def identified(asked: BackfillPlan, file: module.FoundFile) -> module.IdentifiedFile:
         found = identify(asked, file)

@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from sprung.model.signals import MeasurementFault
+from sprung.model.system import System
+from sprung.service.core import build_core
 from sprung.service.errors import Busy, UserError
+from sprung.service.fleet import ray_behind
 from sprung.service.fleet.message import IngestResult, Message, SentWindows
 from sprung.service.fleet.ray_behind import RayBehind
+from sprung.service.fleet.ray_replicas import FoldReplica, IdentifyReplica
 from sprung.service.fleet.serving_sizes import ServingSizes
+from sprung.service.monitoring.batching import AskedWindow
+from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.form import WindowForm
+from sprung.service.settings import Settings
+from sprung.service.store import open_store
+from tests.service_fakes import BelievingExaminer, make_window
 
 pytest.importorskip("ray")
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, when it is imported
@@ -133,3 +149,90 @@ def test_windows_of_one_request_are_identified_and_folded_together() -> None:
         assert identify.sizes == [15] and sum(fold.sizes) == 2
 
     asyncio.run(asked())
+
+
+@dataclass(frozen=True)
+class Called:
+    """A method of a replica, called here."""
+
+    remote: Callable[..., Any]
+
+
+async def followed_on_ray(settings: Settings, sent: list[SentWindows]) -> dict[str, object]:
+    """A vehicle's tracker after windows that were sent one after the other, by the replicas themselves."""
+    identify, fold = IdentifyReplica(settings), FoldReplica(settings)
+    handles = SimpleNamespace(identify=Called(identify.identify), form=Called(identify.form))
+    with closing(fold._ingest):
+        ray = RayBehind(handles, SimpleNamespace(fold=Called(fold.fold)), ServingSizes(replicas=1), batch)
+        for one in sent:
+            assert (await ray.identify_and_fold(one)).folded == len(one.starts)
+        return fold._ingest._pipeline.state(sent[0].vehicle).to_dict()
+
+
+def followed_alone(settings: Settings, engine: Engine, sent: list[SentWindows]) -> dict[str, object]:
+    """The same in a single process."""
+    core = build_core(settings, engine)
+    with closing(core):
+
+        async def ask() -> None:
+            for one in sent:
+                for start, values in zip(one.starts, one.values, strict=True):
+                    asked = AskedWindow(values, core.pipeline.engines.shared, one.vehicle, start=start)
+                    await core.batcher.ask(lambda asked=asked: asked)  # type: ignore[misc]
+
+        asyncio.run(ask())
+        return core.pipeline.state(sent[0].vehicle).to_dict()
+
+
+def test_what_the_tracker_knows_of_a_vehicles_sensors_counts_as_in_a_single_process(
+    engine: Engine, system: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    examiners = [BelievingExaminer(system), BelievingExaminer(system)]
+    windows = [make_window(system, number, 0.01) for number in range(12)]
+    sent = [SentWindows("v-1", [one.start], one.values[None]) for one in windows]
+    folders = [tmp_path / "alone", tmp_path / "ray"]
+    alone, behind_ray = (Settings(data_dir=folder, late_seconds=0.0) for folder in folders)
+    for settings in (alone, behind_ray):
+        open_store(settings.store_url).close()
+    engines = [replace(engine, identifier=examiner) for examiner in examiners]
+    monkeypatch.setattr("sprung.service.monitoring.engine.load_engine", lambda settings: engines[1])
+    expected = followed_alone(alone, engines[0], sent)
+    assert asyncio.run(followed_on_ray(behind_ray, sent)) == expected
+    assert examiners[1].told == examiners[0].told
+    assert examiners[1].told[0] == () and examiners[1].told[-1] == examiners[1].faults
+
+
+def test_faults_that_are_over_and_those_of_too_many_vehicles_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_behind, "MOST_FAULTY", 2)
+    fault: tuple[MeasurementFault, ...] = (MeasurementFault("car_1l", "frozen", 0.0),)
+    told: list[tuple[MeasurementFault, ...]] = []
+    wrong = {f"v-{number}" for number in range(5)}
+
+    async def identify(starts: list[int], values: Any, known: list[tuple[MeasurementFault, ...]]) -> list[None]:
+        told.extend(known)
+        return [None] * len(starts)
+
+    async def fold(messages: list[Message]) -> list[IngestResult]:
+        return [IngestResult(m.vehicle, 1, 0, 0, fault if m.vehicle in wrong else ()) for m in messages]
+
+    async def asked() -> None:
+        handles = SimpleNamespace(identify=Called(identify), form=AskedForm())
+        ray = RayBehind(handles, SimpleNamespace(fold=Called(fold)), ServingSizes(replicas=1), batch)
+        send = partial(_sent_one_by_one, ray)
+        await send(["v-1", "v-1"])
+        assert told[-1] == fault
+        wrong.discard("v-1")
+        await send(["v-1", "v-1"])
+        assert told[-2:] == [fault, ()]
+        await send(["v-2", "v-3", "v-4"])
+        await send(["v-2"])
+        assert told[-1] == ()  # the one that was not heard from for longest
+        await send(["v-4"])
+        assert told[-1] == fault
+
+    asyncio.run(asked())
+
+
+async def _sent_one_by_one(ray: RayBehind, vehicles: list[str]) -> None:
+    for number, vehicle in enumerate(vehicles):
+        await ray.identify_and_fold(window(vehicle, number))

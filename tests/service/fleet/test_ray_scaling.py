@@ -58,11 +58,12 @@ def come_and_go(folder: Path) -> None:
         identify = handle.identify
         assert running() == 1
         windows = np.random.default_rng(1).normal(size=(32, system.window, len(system.channels)))
-        waiting = [identify.remote(list(range(32)), 0.01 * windows) for _ in range(4)]
+        nothing: list[Any] = [()] * 32
+        waiting = [identify.remote(list(range(32)), 0.01 * windows, nothing) for _ in range(4)]
         count = len(waiting)
         while running() < 2 and count < 400:
             waiting = [one for one in waiting if len(one.result(timeout_s=120)) != 32]  # they come to nothing else
-            waiting += [identify.remote(list(range(32)), 0.01 * windows) for _ in range(8)]
+            waiting += [identify.remote(list(range(32)), 0.01 * windows, nothing) for _ in range(8)]
             count += 8
         for one in waiting:
             assert len(one.result(timeout_s=120)) == 32
