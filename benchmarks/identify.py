@@ -7,6 +7,7 @@ Speed: batches on all cores and one window alone, beside scipy and a filterpy UK
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import time
 from collections.abc import Iterator
@@ -243,6 +244,40 @@ def _tracked_speed(system: System) -> Iterator[dict[str, Any]]:
                 "workers": workers,
                 "target": ">= 600 on 2 cores",
             }
+    yield from _beside_each_other(runs.values, off)
+
+
+def _beside_each_other(values: FloatArray, off: FloatArray) -> Iterator[dict[str, Any]]:
+    """The same in as many processes at once as there are cores, each with one worker and windows (B, T, C) of its own
+    vehicle; off: of gains (C,)."""
+    context, count = multiprocessing.get_context("spawn"), os.cpu_count() or 1
+    for name, gains in (("", 0.0 * off), (f", gains off by {100 * OFF:g} % (rms)", off)):
+        together, told = context.Barrier(count), context.SimpleQueue()
+        processes = [
+            context.Process(target=_in_a_process, args=(values * (1 + gains), together, told)) for _ in range(count)
+        ]
+        for process in processes:
+            process.start()
+        found = [told.get() for _ in processes]
+        for process in processes:
+            process.join()
+        yield {
+            "name": f"windows per second, batch, loads and gains free{name}, all processes",
+            "value": round(sum(one["value"] for one in found), 1),
+            "per_cpu_second": round(float(np.mean([one["per_cpu_second"] for one in found])), 1),
+            "processes": count,
+            "target": ">= 600 on 2 cores",
+        }
+
+
+def _in_a_process(values: FloatArray, together: Any, told: Any) -> None:
+    """Speed on windows (B, T, C), from when all processes are ready."""
+    torch.set_num_threads(1)
+    engine = load_engine(settings_with({}))
+    assert isinstance(engine.identifier, Identifier)
+    engine.identifier.workers = 1
+    together.wait()
+    told.put(_followed_speed(engine, values))
 
 
 def _followed_speed(engine: Engine, values: FloatArray) -> dict[str, float]:

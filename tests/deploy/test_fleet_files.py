@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 import yaml
 from typer.main import get_command
@@ -14,6 +17,7 @@ from sprung.service.cli.app import app
 from sprung.service.settings import Settings
 
 FOLDER = Path(__file__).resolve().parents[2] / "deploy" / "fleet"
+SCHEMA = Path(__file__).with_name("rayservice.schema.yaml")
 
 
 def commands(node: Any) -> list[list[str]]:
@@ -73,10 +77,35 @@ def test_ray_s_head_finds_the_redis_that_the_example_brings() -> None:
     assert {mount["name"] for mount in redis["volumeMounts"]} == claims  # and it outlives the pod
 
 
+def ray_service() -> Any:
+    """The one of the example."""
+    return next(d for d in yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()) if d["kind"] == "RayService")
+
+
+def test_the_ray_service_has_the_fields_that_kuberay_takes() -> None:
+    jsonschema.validate(ray_service(), yaml.safe_load(SCHEMA.read_text()))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda spec: spec.update(serveConfig=spec.pop("serveConfigV2")),
+        lambda spec: spec["rayClusterConfig"].pop("headGroupSpec"),
+        lambda spec: spec["rayClusterConfig"].update(enableInTreeAutoscaling="yes"),
+        lambda spec: spec["rayClusterConfig"]["headGroupSpec"]["rayStartParams"].update({"num-cpus": 0}),
+        lambda spec: spec["rayClusterConfig"]["gcsFaultToleranceOptions"].pop("redisAddress"),
+        lambda spec: spec["rayClusterConfig"]["workerGroupSpecs"][0].update(maxReplica=3),
+    ],
+)
+def test_a_ray_service_that_kuberay_would_not_take_is_seen(wrong: Callable[[Any], object]) -> None:
+    document = deepcopy(ray_service())
+    wrong(document["spec"])
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(document, yaml.safe_load(SCHEMA.read_text()))
+
+
 def test_the_application_that_ray_imports_is_there() -> None:
-    document = next(
-        d for d in yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()) if d["kind"] == "RayService"
-    )
+    document = ray_service()
     served = yaml.safe_load(document["spec"]["serveConfigV2"])["applications"][0]
     module, _, name = served["import_path"].partition(":")
     imported = __import__(module, fromlist=[name])
@@ -86,8 +115,6 @@ def test_the_application_that_ray_imports_is_there() -> None:
 @pytest.mark.filterwarnings("ignore")  # Ray's own, when it is imported
 def test_ray_takes_the_configuration_of_its_application() -> None:
     schema = pytest.importorskip("ray.serve.schema")
-    document = next(
-        d for d in yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()) if d["kind"] == "RayService"
-    )
+    document = ray_service()
     config = schema.ServeDeploySchema.model_validate(yaml.safe_load(document["spec"]["serveConfigV2"]))
     assert config.applications[0].args == {"replicas": 32, "least": 2, "cores": 1}
