@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal.windows import tukey
 
+from sprung.model.signal_filters import tukey
 from sprung.model.signals import FloatArray, IntArray
 
 EDGE = 0.2  # share of the window in the taper's cosine edges: leakage falls with the third power, 6 % wider deviations

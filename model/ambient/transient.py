@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from sprung.model.ambient.excitation import Prior
 from sprung.model.ambient.fit import PosteriorFit, fit
@@ -58,7 +58,7 @@ class TransientFit:
     @property
     def adequate(self) -> bool:
         """Whether the structure explains the window."""
-        return bool(self.misfit < norm.isf(self.rules.misjudged / self.rules.parts) and self.fitted.converged)
+        return bool(self.misfit < -ndtri(self.rules.misjudged / self.rules.parts) and self.fitted.converged)
 
     @property
     def covariance(self) -> FloatArray:

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
-from scipy.signal import firwin
 
 from sprung.model.laws import ElementLaw, Motion, SpringDamper
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.laws.trajectory import phi, recall
+from sprung.model.signal_filters import firwin
 from sprung.model.signals import FloatArray
 
 OVERSAMPLING = 16  # steps per sample of laws without memory

@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter, lfilter_zi
 
 from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.signal_filters import lfilter_from, lfilter_zi
 from sprung.model.signals import FloatArray
 
 
@@ -65,7 +65,8 @@ class Covariate:
             kept = np.exp(-share)
             mean = (1 - kept) / share
             numerator, denominator = [1 - mean, mean - kept], [1.0, -kept]
-            series, _ = lfilter(numerator, denominator, series, zi=lfilter_zi(numerator, denominator) * series[0])
+            at_rest = lfilter_zi(numerator, denominator) * series[0]
+            series = lfilter_from(numerator, denominator, series, at_rest)
         return np.interp(time, self.time, series)
 
 

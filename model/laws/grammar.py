@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from scipy.signal import lfilter
 
 from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
 from sprung.model.laws.formula import formula_law
+from sprung.model.signal_filters import lfilter_from
 from sprung.model.signals import FloatArray
 
 DECAYS = "v - z / tau"  # rate of the hidden state
@@ -200,7 +200,7 @@ def filtered(law: ElementLaw, tau: int) -> Callable[[Motion, Values], FloatArray
         step = float(time[1] - time[0])
         kept = float(np.exp(-step / p[tau]))
         gain = p[tau] * (1 - kept) / step  # of a straight line between samples
-        z = lfilter([gain, -gain], [1.0, -kept], d, zi=[-gain * d[0]])[0]
+        z = lfilter_from([gain, -gain], [1.0, -kept], d, [-gain * d[0]])
         return np.asarray(law.force(motion._replace(memory=(z,)), p, SpringDamper(0.0, 0.0)))
 
     return path

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.signal import lfilter
 
 from sprung.model.laws.reversals import Stretches
+from sprung.model.signal_filters import lfilter
 from sprung.model.signals import FloatArray
 
 

@@ -20,7 +20,6 @@ may grow with a small power of the frequency, h (x_i / w1)^b in place of it.
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import lfilter
 
 from sprung.model.laws.base import (
     RARE,
@@ -36,6 +35,7 @@ from sprung.model.laws.base import (
     grid,
 )
 from sprung.model.mechanics import Mechanics
+from sprung.model.signal_filters import lfilter_from
 from sprung.model.signals import FloatArray
 
 _APART = 5.0
@@ -82,7 +82,7 @@ def _path(motion: Motion, p: Values) -> FloatArray:
     for pole, part in zip(_POLES, _weights(np.asarray(p[0]), np.asarray(p[1])), strict=True):
         kept = float(np.exp(-pole * step))
         gain = (1 - kept) / (pole * step)  # of a straight line between samples
-        force += part * lfilter([gain, -gain], [1.0, -kept], d, zi=[-gain * d[0]])[0]
+        force += part * lfilter_from([gain, -gain], [1.0, -kept], d, [-gain * d[0]])
     return force
 
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import firwin, upfirdn
 
 from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
 from sprung.model.mechanics import ACCELERATION, FORCE, Mechanics
+from sprung.model.signal_filters import firwin, upfirdn
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.etd import ForceSteps, Site, force_steps
 from sprung.model.simulate.segments import Solution, solve

@@ -8,7 +8,8 @@ import sys
 
 def imported(modules: str) -> set[str]:
     """What of the slow packages a process has that imports these."""
-    code = f"import sys, {modules}; print(*{{'cantools', 'fastapi', 'scipy', 'torch'}} & sys.modules.keys())"
+    slow = {"cantools", "fastapi", "scipy", "scipy.signal", "scipy.stats", "torch"}
+    code = f"import sys, {modules}; print(*{slow} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
 
@@ -19,3 +20,8 @@ def test_ray_is_started_before_anything_imports_torch() -> None:
 
 def test_the_door_of_ray_serve_has_no_model() -> None:
     assert imported("sprung.service.api.live_ingest, sprung.service.fleet.ray_behind") == {"fastapi"}
+
+
+def test_replicas_import_of_scipy_what_they_need() -> None:
+    what = "sprung.service.fleet.ray_replicas, sprung.service.fleet.ingest, sprung.model.identification.identify"
+    assert imported(what) == {"scipy", "torch"}
