@@ -320,7 +320,7 @@ def _parts_of(ray: KilledPart) -> list[KilledPart]:
     """Processes that the command, or Ray, starts anew."""
     named = {
         "head of Ray": ("gcs_server",),
-        "replica of Serve": ("ServeReplica:sprung:fold", "ServeReplica:sprung:identify"),
+        "replica of Serve": ("ServeReplica:sprung:compute",),
         "door of Serve": ("ServeReplica:sprung:door",),
     }
     return [

@@ -100,7 +100,7 @@ def ingest(workers: int, seconds: float, minutes: float, together: Sequence[int]
             "SPRUNG_LATE_SECONDS": "0",
             "SPRUNG_CLIENT_REQUESTS_PER_SECOND": "1e6",
         }
-        command = ["fleet", "serve", "--workers", str(workers), "--replicas", "1", "--cores", "0.5", "--port"]
+        command = ["fleet", "serve", "--workers", str(workers), "--replicas", "2", "--least", "2", "--port"]
         fleet = served(stack, command, f"{folder}/fleet", more, "/health/ready")
         for windows in together:
             many = SentLoad("/ingest/windows", body, _named(CLIENTS), together=windows)

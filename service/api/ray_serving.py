@@ -1,7 +1,7 @@
 """Live windows on Ray Serve: a door, identification batched over vehicles, folding in one transaction a batch.
 
-Three deployments, each with as many replicas as its queue asks for.  None holds anything that the store does not: a
-replica that dies loses only unacknowledged requests, which their senders repeat.
+Two deployments: the door, and replicas that identify and fold, as many as their queue asks for.  None holds anything
+that the store does not: a replica that dies loses only unacknowledged requests, which their senders repeat.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from typing import Any
 
 from sprung.service.errors import UserError
 from sprung.service.fleet.ray_head import RayHead
-from sprung.service.fleet.ray_replicas import FoldReplica, IdentifyReplica
+from sprung.service.fleet.ray_replicas import ComputeReplica
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
 
 log = logging.getLogger("sprung.ray")
-APPLICATION = "sprung"
-BUSY_BATCHES = 1.5  # of one replica, at work and waiting, beyond which another one is started
+APPLICATION, COMPUTE = "sprung", "compute"
+AT_ONCE = 2  # batches of one replica: what it identifies, and what it folds while the database keeps it waiting
+BUSY_BATCHES = 2.5  # of one replica, at work and waiting, beyond which another one is started
 HEALTH_SECONDS = 1.0  # a replica that died is missed after that
 PROBE_SECONDS = 0.5
 PROBE_TIMEOUT = 10.0  # s: a machine that is busy answers late
@@ -45,20 +46,23 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
         "health_check_period_s": HEALTH_SECONDS,
         "graceful_shutdown_timeout_s": settings.shutdown_seconds,
     }
-    # one request at a time: it is a batch, and they compute
-    shared = watched | {"autoscaling_config": scaling, "max_ongoing_requests": 1}
-    cores = {"num_cpus": sizes.cores}
     deployment: Any = serve.deployment
-    identify = deployment(IdentifyReplica, name="identify", ray_actor_options=cores, **shared)
-    fold = deployment(FoldReplica, name="fold", ray_actor_options={"num_cpus": sizes.cores / 2}, **shared)
+    compute = deployment(
+        ComputeReplica,
+        name=COMPUTE,
+        ray_actor_options={"num_cpus": sizes.cores},
+        autoscaling_config=scaling,
+        max_ongoing_requests=AT_ONCE,
+        **watched,
+    )
 
     def build() -> Any:
         """The door's ASGI application; runs in its replica, and what it needs is imported there alone."""
         from sprung.service.api.live_ingest import ingest_app
         from sprung.service.fleet.ray_behind import RayBehind
 
-        identify, fold = (serve.get_deployment_handle(name, APPLICATION) for name in ("identify", "fold"))
-        return ingest_app(settings, open_store(settings.store_url), RayBehind(identify, fold, sizes, serve.batch))
+        behind = RayBehind(serve.get_deployment_handle(COMPUTE, APPLICATION), sizes, serve.batch)
+        return ingest_app(settings, open_store(settings.store_url), behind)
 
     class Door:
         """Authenticates requests, reads their bodies, passes them on."""
@@ -74,7 +78,7 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
         max_ongoing_requests=8 * sizes.queued,
         **watched,
     )
-    return door.bind(identify.bind(settings), fold.bind(settings))
+    return door.bind(compute.bind(settings))
 
 
 def start(
@@ -157,5 +161,5 @@ def _answers(host: str, port: int) -> bool:
 def from_environment(arguments: dict[str, str]) -> Any:
     """The application as `import_path` of a Serve configuration: settings from SPRUNG_..., sizes from its `args`."""
     replicas, least = int(arguments.get("replicas", 8)), int(arguments.get("least", 1))
-    sizes = ServingSizes(replicas=replicas, least=least, cores=float(arguments.get("cores", 1.0)))
+    sizes = ServingSizes(replicas=replicas, least=least, cores=float(arguments.get("cores", 0.8)))
     return application(settings_with({}), sizes)

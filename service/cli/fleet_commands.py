@@ -135,9 +135,9 @@ def serve(
         str | None, typer.Option("--ray", envvar="RAY_ADDRESS", help="A running cluster; default: a Ray started here.")
     ] = None,
     workers: Workers = None,
-    replicas: Annotated[int, typer.Option("--replicas", min=1, help="Of each deployment, at most.")] = 8,
+    replicas: Annotated[int, typer.Option("--replicas", min=1, help="That identify and track, at most.")] = 8,
     least: Annotated[int, typer.Option("--least", min=1, help="Of these; with 2, one that dies is not missed.")] = 1,
-    cores: Annotated[float, typer.Option("--cores", min=0.1, help="Of a replica that identifies.")] = 1.0,
+    cores: Annotated[float, typer.Option("--cores", min=0.1, help="Of a replica.")] = 0.8,
     system: System = None,
     weights: Weights = None,
 ) -> int:

@@ -20,13 +20,12 @@ MOST_FAULTY = 10_000  # vehicles whose faults are held; one that is heard from a
 
 
 class RayBehind:
-    """What the door sees of the two.  Requests are put together here: a call costs more than a window's identification,
+    """What the door sees of them.  Requests are put together here: a call costs more than a window's identification,
     so that one carries the windows, or the messages, of all that ask at a time."""
 
-    def __init__(self, identify: Any, fold: Any, sizes: ServingSizes, batch: Callable[..., Any]) -> None:
-        """identify, fold: handles of the deployments; batch: `serve.batch`, which runs in a replica only."""
-        self._identify = identify
-        self._fold = fold
+    def __init__(self, compute: Any, sizes: ServingSizes, batch: Callable[..., Any]) -> None:
+        """compute: handle of the deployment; batch: `serve.batch`, which runs in a replica only."""
+        self._compute = compute
         self._form: WindowForm | None = None
         self._faults: OrderedDict[str, tuple[MeasurementFault, ...]] = OrderedDict()  # where there are any
         self._waiting, self._most = 0, sizes.queued * sizes.replicas
@@ -36,9 +35,9 @@ class RayBehind:
         self._folded = batch(max_batch_size=sizes.batch_messages, **wait)(self._fold_together)
 
     async def form(self) -> WindowForm:
-        """What windows look like, from a replica that identifies; waits for the first of them."""
+        """What windows look like, from a replica; waits for the first of them."""
         if self._form is None:
-            self._form = await _asked(self._identify.form.remote())
+            self._form = await _asked(self._compute.form.remote())
         return self._form
 
     async def fold(self, body: bytes) -> IngestResult:
@@ -86,13 +85,11 @@ class RayBehind:
         self, asked: list[tuple[int, FloatArray, tuple[MeasurementFault, ...]]]
     ) -> list[Estimate]:
         starts, values, known = zip(*asked, strict=True)
-        found: list[Estimate] = await _asked(
-            self._identify.identify.remote(list(starts), np.stack(values), list(known))
-        )
+        found: list[Estimate] = await _asked(self._compute.identify.remote(list(starts), np.stack(values), list(known)))
         return found
 
     async def _fold_together(self, messages: list[Message]) -> list[IngestResult | UserError]:
-        found: list[IngestResult | UserError] = await _asked(self._fold.fold.remote(messages))
+        found: list[IngestResult | UserError] = await _asked(self._compute.fold.remote(messages))
         return found
 
 

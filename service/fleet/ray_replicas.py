@@ -18,14 +18,26 @@ from sprung.service.settings import Settings
 from sprung.service.store import open_store
 
 
-class IdentifyReplica:
-    """Windows of any vehicles -> estimates."""
+class ComputeReplica:
+    """Windows of any vehicles -> estimates; messages of any vehicles -> trackers and store.
+
+    One process for both: each would have to import the same for seconds, and of two that do one thing each, one is idle
+    while the other one has too much.
+    """
 
     def __init__(self, settings: Settings) -> None:
         one_thread_each()
+        from sprung.service.fleet.ingest import Ingest
+        from sprung.service.monitoring.compute import Compute
         from sprung.service.monitoring.engine import load_engine
+        from sprung.service.monitoring.pipeline import Pipeline
 
         self._engine = load_engine(settings)
+        self._identifying = asyncio.Lock()  # an identifier is for one thread at a time
+        store = open_store(settings.store_url)
+        pipeline = Pipeline(self._engine, store, Compute(1), vehicles_in_memory=settings.vehicles_in_memory)
+        self._ingest = Ingest(pipeline, settings.late_seconds)
+        self._ingest.start()
 
     async def form(self) -> WindowForm:
         """What windows have to look like."""
@@ -36,23 +48,8 @@ class IdentifyReplica:
     ) -> list[Estimate]:
         """The estimates of windows, values (B, T, C); known: faults of each one's vehicle, as `Engine.identify` has
         them."""
-        return (await asyncio.to_thread(self._engine.identify, values, starts=starts, known=known))[0]
-
-
-class FoldReplica:
-    """Messages of any vehicles -> trackers and store."""
-
-    def __init__(self, settings: Settings) -> None:
-        one_thread_each()
-        from sprung.service.fleet.ingest import Ingest
-        from sprung.service.monitoring.compute import Compute
-        from sprung.service.monitoring.engine import load_engine
-        from sprung.service.monitoring.pipeline import Pipeline
-
-        store = open_store(settings.store_url)
-        pipeline = Pipeline(load_engine(settings), store, Compute(1), vehicles_in_memory=settings.vehicles_in_memory)
-        self._ingest = Ingest(pipeline, settings.late_seconds)
-        self._ingest.start()
+        async with self._identifying:
+            return (await asyncio.to_thread(self._engine.identify, values, starts=starts, known=known))[0]
 
     async def fold(self, messages: Sequence[Message]) -> list[IngestResult | UserError]:
         """What became of each message; they are stored, but for those with an error."""

@@ -21,7 +21,7 @@ from sprung.service.errors import Busy, UserError
 from sprung.service.fleet import ray_behind
 from sprung.service.fleet.message import IngestResult, Message, SentWindows
 from sprung.service.fleet.ray_behind import RayBehind
-from sprung.service.fleet.ray_replicas import FoldReplica, IdentifyReplica
+from sprung.service.fleet.ray_replicas import ComputeReplica
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.monitoring.batching import AskedWindow
 from sprung.service.monitoring.engine import Engine
@@ -48,13 +48,11 @@ class AskedForm:
 
 
 class Remote:
-    """A deployment's handle, here: the method's answers, and how many each call carried."""
+    """A method of a deployment's handle, here: its answers, and how many each call carried."""
 
-    def __init__(self, name: str, answer: Any) -> None:
+    def __init__(self, answer: Any) -> None:
         self.sizes: list[int] = []
-        self.form = AskedForm()
         self._answer = answer
-        setattr(self, name, self)
 
     async def remote(self, first: list[Any], *rest: Any) -> list[Any]:
         self.sizes.append(len(first))
@@ -99,18 +97,27 @@ def taken(message: Message) -> IngestResult | UserError:
     )
 
 
-def behind(**sizes: Any) -> tuple[RayBehind, Remote, Remote]:
-    identify, fold = Remote("identify", lambda start: None), Remote("fold", taken)
-    return RayBehind(identify, fold, ServingSizes(**sizes), batch), identify, fold
+@dataclass(frozen=True)
+class Handle:
+    """A deployment's handle, here."""
+
+    identify: Remote
+    fold: Remote
+    form: AskedForm
+
+
+def behind(**sizes: Any) -> tuple[RayBehind, Handle]:
+    handle = Handle(Remote(lambda start: None), Remote(taken), AskedForm())
+    return RayBehind(handle, ServingSizes(**sizes), batch), handle
 
 
 def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
     async def asked() -> list[Any]:
-        ray, identify, fold = behind(replicas=1, batch_windows=8, batch_wait_seconds=0.05)
+        ray, handle = behind(replicas=1, batch_windows=8, batch_wait_seconds=0.05)
         calls = [ray.identify_and_fold(window(f"v-{i}", i)) for i in range(8)]
         found = await asyncio.gather(*calls, return_exceptions=True)
-        assert identify.sizes == [8]
-        assert sum(fold.sizes) == 8 and len(fold.sizes) <= 2
+        assert handle.identify.sizes == [8]
+        assert sum(handle.fold.sizes) == 8 and len(handle.fold.sizes) <= 2
         return found
 
     found = asyncio.run(asked())
@@ -120,17 +127,17 @@ def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
 
 def test_what_windows_look_like_is_asked_once() -> None:
     async def asked() -> None:
-        ray, identify, fold = behind(replicas=1)
+        ray, handle = behind(replicas=1)
         assert await ray.form() == FORM
         await ray.identify_and_fold(window("v-1", 0))
-        assert (identify.form.asked, fold.form.asked) == (1, 0)
+        assert handle.form.asked == 1
 
     asyncio.run(asked())
 
 
 def test_too_many_at_once_are_told_so_and_places_come_free() -> None:
     async def asked() -> None:
-        ray, _, _ = behind(replicas=1, queued=2)
+        ray, _ = behind(replicas=1, queued=2)
         calls = [ray.identify_and_fold(window(f"v-{10 + i}", i)) for i in range(3)]
         found = await asyncio.gather(*calls, return_exceptions=True)
         assert [isinstance(one, Busy) for one in found] == [False, False, True]
@@ -141,12 +148,12 @@ def test_too_many_at_once_are_told_so_and_places_come_free() -> None:
 
 def test_windows_of_one_request_are_identified_and_folded_together() -> None:
     async def asked() -> None:
-        ray, identify, fold = behind(replicas=1, batch_windows=32, batch_wait_seconds=0.05)
+        ray, handle = behind(replicas=1, batch_windows=32, batch_wait_seconds=0.05)
         found = await asyncio.gather(
             ray.identify_and_fold(window("v-1", 0, 10)), ray.identify_and_fold(window("v-2", 0, 5))
         )
         assert [one.folded for one in found] == [10, 5]
-        assert identify.sizes == [15] and sum(fold.sizes) == 2
+        assert handle.identify.sizes == [15] and sum(handle.fold.sizes) == 2
 
     asyncio.run(asked())
 
@@ -159,14 +166,14 @@ class Called:
 
 
 async def followed_on_ray(settings: Settings, sent: list[SentWindows]) -> dict[str, object]:
-    """A vehicle's tracker after windows that were sent one after the other, by the replicas themselves."""
-    identify, fold = IdentifyReplica(settings), FoldReplica(settings)
-    handles = SimpleNamespace(identify=Called(identify.identify), form=Called(identify.form))
-    with closing(fold._ingest):
-        ray = RayBehind(handles, SimpleNamespace(fold=Called(fold.fold)), ServingSizes(replicas=1), batch)
+    """A vehicle's tracker after windows that were sent one after the other, by a replica itself."""
+    replica = ComputeReplica(settings)
+    methods = {name: Called(getattr(replica, name)) for name in ("form", "identify", "fold")}
+    with closing(replica._ingest):
+        ray = RayBehind(SimpleNamespace(**methods), ServingSizes(replicas=1), batch)
         for one in sent:
             assert (await ray.identify_and_fold(one)).folded == len(one.starts)
-        return fold._ingest._pipeline.state(sent[0].vehicle).to_dict()
+        return replica._ingest._pipeline.state(sent[0].vehicle).to_dict()
 
 
 def followed_alone(settings: Settings, engine: Engine, sent: list[SentWindows]) -> dict[str, object]:
@@ -216,8 +223,8 @@ def test_faults_that_are_over_and_those_of_too_many_vehicles_are_forgotten(monke
         return [IngestResult(m.vehicle, 1, 0, 0, fault if m.vehicle in wrong else ()) for m in messages]
 
     async def asked() -> None:
-        handles = SimpleNamespace(identify=Called(identify), form=AskedForm())
-        ray = RayBehind(handles, SimpleNamespace(fold=Called(fold)), ServingSizes(replicas=1), batch)
+        handle = SimpleNamespace(identify=Called(identify), form=AskedForm(), fold=Called(fold))
+        ray = RayBehind(handle, ServingSizes(replicas=1), batch)
         send = partial(_sent_one_by_one, ray)
         await send(["v-1", "v-1"])
         assert told[-1] == fault

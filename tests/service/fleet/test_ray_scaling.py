@@ -13,7 +13,7 @@ import pytest
 
 from sprung.model.system import load_system
 from sprung.service.api import ray_serving
-from sprung.service.api.ray_serving import APPLICATION
+from sprung.service.api.ray_serving import APPLICATION, COMPUTE
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import Settings
 from tests.ray_apart import in_own_process
@@ -24,10 +24,10 @@ SIZES = ServingSizes(replicas=2, cores=0.5, more_after_seconds=1.0, fewer_after_
 
 
 def running() -> int:
-    """Replicas that identify."""
+    """Replicas that compute."""
     from ray import serve
 
-    found: dict[Any, int] = serve.status().applications[APPLICATION].deployments["identify"].replica_states
+    found: dict[Any, int] = serve.status().applications[APPLICATION].deployments[COMPUTE].replica_states
     return int(found.get("RUNNING", 0))
 
 
@@ -53,7 +53,7 @@ def come_and_go(folder: Path) -> None:
         port = int(probe.getsockname()[1])
     settings = Settings(data_dir=folder, store=f"sqlite:///{folder}/sprung.db")
     head = ray_serving.start(settings, SIZES, "127.0.0.1", port, None, 2)
-    handle: Any = serve.get_deployment_handle("identify", APPLICATION)
+    handle: Any = serve.get_deployment_handle(COMPUTE, APPLICATION)
     try:
         identify = handle.identify
         assert running() == 1
