@@ -125,6 +125,7 @@ LATE_OUTSIDE = {
     "service/monitoring/engine.py": "torch, which processes that are forked before it may not have loaded",
     "service/monitoring/simulated.py": "torch, the same",
     "service/fleet/ray_replicas.py": "torch, in replicas: who starts them starts Ray's own processes first",
+    "service/store/engine.py": "alembic, where somebody else has migrated the store",
     "service/api/ray_serving.py": "FastAPI, in the door's replica alone",
     "service/diagnosis/worker.py": "threads of linear algebra are bounded before it is loaded",
 }

@@ -16,6 +16,7 @@ from sprung.service.errors import UserError
 from sprung.service.fleet.ray_head import RayHead
 from sprung.service.fleet.ray_replicas import ComputeReplica
 from sprung.service.fleet.serving_sizes import ServingSizes
+from sprung.service.processes.imports import lasting_imports
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
 
@@ -30,8 +31,8 @@ SILENT_SECONDS = 10.0  # without an answer
 ABANDON_SECONDS = 10.0
 
 
-def application(settings: Settings, sizes: ServingSizes) -> Any:
-    """The Serve application: `serve.run(application(...))`."""
+def application(settings: Settings, sizes: ServingSizes, migrated: bool = False) -> Any:
+    """The Serve application: `serve.run(application(...))`; migrated: the store has been."""
     from ray import serve
 
     least = min(sizes.least, sizes.replicas)
@@ -58,11 +59,12 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
 
     def build() -> Any:
         """The door's ASGI application; runs in its replica, and what it needs is imported there alone."""
-        from sprung.service.api.live_ingest import ingest_app
-        from sprung.service.fleet.ray_behind import RayBehind
+        with lasting_imports():
+            from sprung.service.api.live_ingest import ingest_app
+            from sprung.service.fleet.ray_behind import RayBehind
 
         behind = RayBehind(serve.get_deployment_handle(COMPUTE, APPLICATION), sizes, serve.batch)
-        return ingest_app(settings, open_store(settings.store_url), behind)
+        return ingest_app(settings, open_store(settings.store_url, migrated), behind)
 
     class Door:
         """Authenticates requests, reads their bodies, passes them on."""
@@ -78,7 +80,7 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
         max_ongoing_requests=8 * sizes.queued,
         **watched,
     )
-    return door.bind(compute.bind(settings))
+    return door.bind(compute.bind(settings, migrated))
 
 
 def start(
@@ -86,11 +88,12 @@ def start(
 ) -> RayHead | None:
     """Serve on the cluster at `address`, or on a Ray that is started here; returns when requests are taken.
 
-    The head of a Ray that was started here.
+    The store must have been migrated.  The head of a Ray that was started here.
     """
     try:
-        import ray
-        from ray import serve
+        with lasting_imports():
+            import ray
+            from ray import serve
     except ModuleNotFoundError as error:
         raise UserError("Ray is not installed: pip install 'sprung[fleet]'") from error
     head = None
@@ -99,7 +102,7 @@ def start(
     else:
         head = RayHead(cores)
     serve.start(http_options={"host": host, "port": port})
-    serve.run(application(settings, sizes), name=APPLICATION, route_prefix="/")
+    serve.run(application(settings, sizes, migrated=True), name=APPLICATION, route_prefix="/")
     return head
 
 

@@ -13,6 +13,7 @@ from sprung.model.signals import Estimate, FloatArray, MeasurementFault
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import IngestResult, Message
 from sprung.service.monitoring.form import WindowForm
+from sprung.service.processes.imports import lasting_imports
 from sprung.service.processes.threads import one_thread_each
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
@@ -25,16 +26,18 @@ class ComputeReplica:
     while the other one has too much.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, migrated: bool = False) -> None:
+        """migrated: the store has been, and need not be looked at."""
         one_thread_each()
-        from sprung.service.fleet.ingest import Ingest
-        from sprung.service.monitoring.compute import Compute
-        from sprung.service.monitoring.engine import load_engine
-        from sprung.service.monitoring.pipeline import Pipeline
+        with lasting_imports():
+            from sprung.service.fleet.ingest import Ingest
+            from sprung.service.monitoring.compute import Compute
+            from sprung.service.monitoring.engine import load_engine
+            from sprung.service.monitoring.pipeline import Pipeline
 
-        self._engine = load_engine(settings)
+            self._engine = load_engine(settings)
         self._identifying = asyncio.Lock()  # an identifier is for one thread at a time
-        store = open_store(settings.store_url)
+        store = open_store(settings.store_url, migrated)
         pipeline = Pipeline(self._engine, store, Compute(1), vehicles_in_memory=settings.vehicles_in_memory)
         self._ingest = Ingest(pipeline, settings.late_seconds)
         self._ingest.start()

@@ -1,1 +1,1 @@
-"""Alembic's migrations of the store; run at every start by `service.store.engine.migrate`."""
+"""Alembic's migrations of the store; run at every start by `service.store.migrating.migrate`."""

@@ -1,4 +1,4 @@
-"""Run by Alembic: migrate the connection that `service.store.engine.migrate` hands over."""
+"""Run by Alembic: migrate the connection that `service.store.migrating.migrate` hands over."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Opening a store: the engine, SQLite's pragmas, migrations, and transactions.
+"""Opening a store: the engine, SQLite's pragmas, and transactions.
 
 SQLite has one writer, so a process lets one transaction write at a time.  On PostgreSQL many write at once, and who
 reads a vehicle's tracker to write it holds the vehicle's row (`fleet.hold_vehicle`).
@@ -14,11 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from alembic import command
-from alembic.config import Config
-from alembic.util import CommandError
 from pydantic_core import to_json
-from sqlalchemy import URL, Connection, Engine, Table, create_engine, event, inspect, text
+from sqlalchemy import URL, Connection, Engine, Table, create_engine, event, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import ExceptionContext, make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
@@ -29,10 +26,8 @@ BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one
 PROBE_SECONDS = 2.0
 KEPT_READERS, MOST_READERS = 8, 32  # connections to SQLite that stay open; more while as many requests read at once
 MOST_WRITERS = 10  # transactions of one process at once on PostgreSQL; others wait
-MIGRATING = 0x5B_70_72_74  # of the advisory lock
 STATEMENT_MILLISECONDS = 60_000  # a statement that takes longer is given up: its caller tries again
 UPSERT_DIALECTS = ("sqlite", "postgresql")
-VERSIONS = "alembic_version"  # the table that every store of Sprung's has
 
 
 class Store:
@@ -112,8 +107,11 @@ def open_store(url: str, migrated: bool = False) -> Store:
             engine = _postgresql_engine(parsed)
         store = Store(engine)
         if not migrated:
+            from sprung.service.store.migrating import migrate
+
             try:
-                migrate(store)
+                with store.write() as connection:
+                    migrate(connection)
             except BaseException:
                 store.close()
                 raise
@@ -121,37 +119,9 @@ def open_store(url: str, migrated: bool = False) -> Store:
         raise UserError(f"store {shown}: {error.name} is missing; pip install 'sprung[fleet]'") from error
     except (ArgumentError, NoSuchModuleError) as error:
         raise UserError(f"store {shown}: not a usable database URL ({_first_line(error)})") from error
-    except CommandError as error:  # a revision that this version does not know
-        raise UserError(f"store {shown}: a newer version of Sprung has written it; nothing was changed") from error
     except (DatabaseError, OSError) as error:
         raise UserError(f"store {shown}: cannot be opened ({_first_line(error)})") from error
     return store
-
-
-def migrate(store: Store) -> None:
-    """Bring the schema to the newest revision; nothing happens when it is there already.
-
-    Raises UserError for a file that is another program's.
-    """
-    config = Config()
-    config.set_main_option("script_location", "sprung.service:migrations")
-    config.set_main_option("path_separator", "os")
-    with store.write() as connection:
-        if connection.dialect.name == "sqlite":
-            _refuse_foreign(connection)
-        if store.many_writers:  # processes that start together migrate one after the other, however long it takes
-            connection.execute(text("SET LOCAL statement_timeout = 0"))
-            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": MIGRATING})
-        config.attributes["connection"] = connection
-        command.upgrade(config, "head")
-
-
-def _refuse_foreign(connection: Connection) -> None:
-    """Raise UserError for a file that is another program's."""
-    tables = set(inspect(connection).get_table_names())
-    if tables and VERSIONS not in tables:
-        name = connection.engine.url.database
-        raise UserError(f"store {name}: a database of another program (it has a table {min(tables)!r}); choose another")
 
 
 def insert_or_ignore(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) -> None:

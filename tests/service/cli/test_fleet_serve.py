@@ -8,7 +8,7 @@ import sys
 
 def imported(modules: str) -> set[str]:
     """What of the slow packages a process has that imports these."""
-    slow = {"cantools", "fastapi", "scipy", "scipy.signal", "scipy.stats", "torch"}
+    slow = {"alembic", "cantools", "fastapi", "scipy", "scipy.signal", "scipy.stats", "torch"}
     code = f"import sys, {modules}; print(*{slow} & sys.modules.keys())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(done.stdout.split())

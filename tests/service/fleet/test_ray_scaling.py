@@ -16,6 +16,7 @@ from sprung.service.api import ray_serving
 from sprung.service.api.ray_serving import APPLICATION, COMPUTE
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import Settings
+from sprung.service.store import open_store
 from tests.ray_apart import in_own_process
 
 pytest.importorskip("ray.serve")
@@ -52,6 +53,7 @@ def come_and_go(folder: Path) -> None:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
     settings = Settings(data_dir=folder, store=f"sqlite:///{folder}/sprung.db")
+    open_store(settings.store_url).close()
     head = ray_serving.start(settings, SIZES, "127.0.0.1", port, None, 2)
     handle: Any = serve.get_deployment_handle(COMPUTE, APPLICATION)
     try:
