@@ -330,7 +330,7 @@ class Tracker:
         chosen = np.zeros(H, dtype=bool)
         for at in self.model.groups:  # all or none: differences between channels are what windows determine
             chosen[at] = far[at].any()
-        return (*hard, *named(self.deviations, off, np.zeros(H), chosen))
+        return (*hard, *named(self.deviations, off, np.zeros(H), chosen)) if chosen.any() else hard
 
     def sensors(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
         """Sensor faults: stuck channels, and gains and delays that differ from the system file."""
