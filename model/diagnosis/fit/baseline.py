@@ -117,6 +117,14 @@ def settled(problem: Problem, fit: Fit) -> Fit:
     return fit
 
 
+def settled_and_refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """Noise levels at a fit, which is continued beside them until it converges, and the levels at its end."""
+    problem, fit = refreshed(problem, fit)
+    if fit.converged or problem.process_noise:
+        return problem, fit
+    return refreshed(problem, settled(problem, fit))
+
+
 def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     """Noise levels and whitening estimated at a fit, and the fit repeated with them.
 

@@ -10,7 +10,14 @@ import numpy as np
 from sprung.model.diagnosis.fit.columns import JacobianColumns
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import Working
-from sprung.model.diagnosis.fit.tangent import SmootherCorrection, law_change, port_motions, step_of, tangent
+from sprung.model.diagnosis.fit.tangent import (
+    SmootherCorrection,
+    law_change,
+    law_change_by_element,
+    port_motions,
+    step_of,
+    tangent,
+)
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
@@ -42,6 +49,7 @@ class Linearised:
     forces: LawForces | None
     shown: ComplexArray  # sensor signals without the free motion, (F, S)
     free: ComplexArray  # motion per state at the first sample, (F, S, 2n)
+    fine: bool = False  # whether the reaction of the laws is that on the oversampled axis
 
     @cached_property
     def spectrum(self) -> ComplexArray:
@@ -67,6 +75,12 @@ class Linearised:
         return motions_of(self.forward, self.forces, self.point.state)
 
     @property
+    def may_be_finer(self) -> bool:
+        """Whether there are laws whose reaction is not that on the oversampled axis yet."""
+        beside = self.forces is not None and not self.problem.process_noise and not self.forward.plant.floats
+        return beside and not self.fine
+
+    @property
     def jacobian(self) -> FloatArray:
         """Of the model, whitened, columns theta, term parameters (internal scale), state: (R, P + p + 2n)."""
         return self._sensitivities.packed.jacobian
@@ -88,7 +102,8 @@ class Linearised:
         _add_terms(known, problem, point, working, self.forward, self.forces, self.shown, self.motions)
         known.packed.add_free(len(known.log_det), self.free)
         if self.forces is not None:
-            _add_laws_answers(known, problem, working.whitener, self.forward, self.forces, self.free.shape[2])
+            whitener, states = working.whitener, self.free.shape[2]
+            _add_laws_answers(known, problem, whitener, self.forward, self.forces, states, fine=self.fine)
         return known
 
 
@@ -105,7 +120,7 @@ def sensitivities_to_loads(
         JacobianColumns(forward, whitener, last + states),
         np.zeros((bins, parameters), dtype=complex),
         dict(enumerate(loads, parameters)),
-        np.zeros((bins, len(loads), len(forces.terms)), dtype=complex),
+        np.zeros((bins, last, len(forces.terms)), dtype=complex),
         np.zeros(last),
     )
     for column, load in known.loads.items():
@@ -121,19 +136,22 @@ class _Sensitivities:
     packed: JacobianColumns
     theta_forces: ComplexArray  # along the parameters' elements, (F, P)
     loads: dict[int, ComplexArray]  # on the degrees of freedom, (F, n), by column
-    law_forces: ComplexArray  # of the laws by their own parameters, (F, p, m)
+    law_forces: ComplexArray  # of the laws along the present motion, (F, P + p, m)
     log_det: FloatArray  # (P + p,)
     shifts: dict[int, FloatArray] = field(
         default_factory=dict
     )  # motion along ports, (2, N, m), by column, of terms that move bodies directly
 
 
-def linearise(problem: Problem, point: Point, working: Working) -> Linearised:
-    """Residual and sensitivities at a point."""
+def linearise(problem: Problem, point: Point, working: Working, *, fine: bool = False) -> Linearised:
+    """Residual and sensitivities at a point.
+
+    fine: with the reaction of the laws on the oversampled axis (`tangent`).
+    """
     if problem.work is not None:
         problem.work.add(problem.part.grid.samples)
     shown, forward, forces = problem.predict(point, working.inputs, working.plant)
-    return Linearised(problem, point, working, forward, forces, shown, problem.free_columns(forward))
+    return Linearised(problem, point, working, forward, forces, shown, problem.free_columns(forward), fine)
 
 
 def _of_theta(
@@ -152,7 +170,10 @@ def _of_theta(
     if problem.process_noise:
         slopes[:P] = _log_det_slopes(forward, whitener)
     laws = 0 if forces is None else len(forces.terms)
-    law_forces = np.zeros((len(forward.part.grid.omega), p, laws), dtype=complex)
+    law_forces = np.zeros((len(forward.part.grid.omega), P + p, laws), dtype=complex)
+    for i, port, change in () if forces is None else law_change_by_element(forward, forces):
+        law_forces[:, i, port] = change
+        packed.add_port(i, forces.ports[port], change)
     return _Sensitivities(packed, theta_forces, loads, law_forces, slopes)
 
 
@@ -171,7 +192,7 @@ def _add_terms(
     Another mass gets its column in the same way as an estimated one: what masses, stiffnesses and dampings together
     leave unchanged is not determined, however approximate the reaction of the laws is.
     """
-    at = P = len(point.theta)
+    at = len(point.theta)
     pushed = forward.with_part(problem.driving(forward))
     for index, term in enumerate(point.terms):
         for j in range(len(term.parameters)):
@@ -189,7 +210,7 @@ def _add_terms(
                     known.log_det[at] = working.whitener.log_det_slope(change)
             elif forces is not None and evaluated_in_time(term):
                 port, change = law_change(forward, forces, term, j)
-                known.law_forces[:, at - P, port] = change
+                known.law_forces[:, at, port] = change
                 known.packed.add_port(at, forces.ports[port], change)
             else:
                 effect = _difference(problem, point, working, (index, j), forward, forces, shown)
@@ -201,7 +222,14 @@ def _add_terms(
 
 
 def _add_laws_answers(
-    known: _Sensitivities, problem: Problem, whitener: Whitener, forward: Forward, forces: LawForces, states: int
+    known: _Sensitivities,
+    problem: Problem,
+    whitener: Whitener,
+    forward: Forward,
+    forces: LawForces,
+    states: int,
+    *,
+    fine: bool = False,
 ) -> None:
     """Adds the reaction of the laws to the motion of every column."""
     along = port_motions(forward, forces, known.theta_forces, known.loads, known.law_forces, states)
@@ -210,7 +238,7 @@ def _add_laws_answers(
     correction = SmootherCorrection(whitener, forward, forces) if problem.process_noise else None
     if correction is not None:
         along = along - correction.motion(known.packed.whitened)
-    extra = tangent(forward, forces, along, correction)
+    extra = tangent(forward, forces, along, correction, fine=fine)
     for k, port in enumerate(forces.ports):
         for column in range(extra.shape[2]):
             known.packed.add_port(column, port, extra[:, k, column])

@@ -32,7 +32,7 @@ from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
 _DAMPING = (1e-6, 1e3)  # first and most, of the scaled normal equations
-_MUCH = 0.03  # of chi-square, that a step promises: if it fails, its initial state is estimated anew
+_MUCH = 0.03  # of chi-square, that a step promises: if it fails, initial state and reaction of the laws are refined
 _STARTS, _LOWER = 5, 0.01  # of these, at most, while each lowers the objective by this share
 _HOPEFUL = 0.5  # of the fall that is needed, that it has to promise; where it succeeded, it promised 0.96 and more
 
@@ -185,7 +185,7 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
         size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
         grain = _grain(problem, state)
         trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.spectrum)
-        proposed = _state(problem, trial, working)
+        proposed = _state(problem, trial, working, fine=state.lin.fine)
         if unforced:
             proposed = _begun_anew(problem, proposed)
         if proposed.value >= state.value and promised < rules.numerical * grain:
@@ -204,6 +204,8 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
                 break
             if count in (2, 4):
                 state = replace(state, point=with_equivalents(problem, state.point, state.working.inputs))
+        elif promised > _MUCH * state.chi_square and state.lin.may_be_finer:
+            left, state = promised, replace(state, lin=replace(state.lin, fine=True))
         else:
             left = promised
             damping = max(damping * 30, 100 * _DAMPING[0])
@@ -226,9 +228,9 @@ def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[P
     return opened(problem, with_equivalents(problem, start, None), whitener)
 
 
-def _state(problem: Problem, point: Point, working: Working) -> _State:
+def _state(problem: Problem, point: Point, working: Working, *, fine: bool = False) -> _State:
     """The model linearised at a point.  Objective: twice the negative log-posterior, up to a constant."""
-    lin = linearise(problem, point, working)
+    lin = linearise(problem, point, working, fine=fine)
     value = _value(problem, lin.residual, lin.log_det, point)
     return _State(replace(point, warm_start=warm_start_of(lin.forces)), working, lin, value)
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
+from scipy.fft import irfft, rfft
+from scipy.interpolate import CubicSpline
 
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import StaticLaw
 from sprung.model.signals import FloatArray
 
-_KRYLOV, _KRYLOV_TOLERANCE = 16, 3e-3
+_KRYLOV, _FINE_KRYLOV, _KRYLOV_TOLERANCE = 16, 60, 3e-3
 _RELATIVE_STEP = 1e-4  # of finite differences
 
 
@@ -37,6 +40,23 @@ def law_change(forward: Forward, forces: LawForces, term: Term, parameter: int) 
     return port, forward.part.grid.coarse_forces(change)
 
 
+def law_change_by_element(forward: Forward, forces: LawForces) -> Iterator[tuple[int, int, ComplexArray]]:
+    """Number of a parameter, port of a law, spectrum (F,) of its force's derivative by the parameter's log-ratio.
+
+    Of laws whose force depends on the spring or damper of their element, as that of a valve does.
+    """
+    names = [term.location.partition("|")[0] for term in forces.terms]
+    for i, parameter in enumerate(forward.system.parameters):
+        for port, term in enumerate(forces.terms):
+            if names[port] != parameter.element or parameter.quantity == "mass":
+                continue
+            own = forward.element_of(term)
+            more = own._replace(**{parameter.quantity: getattr(own, parameter.quantity) * np.exp(_RELATIVE_STEP)})
+            change = _force_of(forward, term, forces, port, more) - _force_of(forward, term, forces, port, own)
+            if np.any(change):
+                yield i, port, forward.part.grid.coarse_forces(change / _RELATIVE_STEP)
+
+
 def port_motions(
     forward: Forward,
     forces: LawForces,
@@ -47,28 +67,28 @@ def port_motions(
 ) -> FloatArray:
     """Deflection and rate along the laws' ports per unit of every free value, (2, N, m, columns).
 
-    theta_forces, law_forces: sources along elements; loads: on the degrees of freedom, (F, n), by column.
+    theta_forces (F, P), law_forces (F, P + p, m): sources along elements and ports; loads: on the degrees of freedom,
+    (F, n), by column.
     """
     plant, grid = forward.plant, forward.part.grid
     structure = plant.structure
     ports = forward.plant.structure.padded(forces.ports)
-    P, p = theta_forces.shape[1], law_forces.shape[1]
-    spectra = np.zeros((len(grid.omega), len(ports), P + p), dtype=complex)
+    count = law_forces.shape[1]
     of_force = plant.compliance(ports, np.eye(len(structure.H)))  # (F, m, E)
+    spectra = (of_force @ ports.T) @ law_forces.transpose(0, 2, 1)
     for i, parameter in enumerate(forward.system.parameters):
         if i not in loads:
             e = forward.system.elements.index(parameter.element)
-            spectra[:, :, i] = of_force[:, :, e] * theta_forces[:, i, None]
-    spectra[:, :, P:] = (of_force @ ports.T) @ law_forces.transpose(0, 2, 1)
+            spectra[:, :, i] += of_force[:, :, e] * theta_forces[:, i, None]
     for column, load in loads.items():
         spectra[:, :, column] = np.einsum("fmn,fn->fm", plant.deflection_of_load(ports), load)
     free = plant.free_motion(structure.motion_rows(ports), grid.step, grid.samples).reshape(
         grid.samples, 2, len(ports), states
     )
-    result = np.empty((2, grid.samples, len(ports), P + p + states))
-    result[0, :, :, : P + p] = grid.inverse(spectra)
-    result[1, :, :, : P + p] = grid.inverse(1j * grid.omega[:, None, None] * spectra)
-    result[:, :, :, P + p :] = free.transpose(1, 0, 2, 3)
+    result = np.empty((2, grid.samples, len(ports), count + states))
+    result[0, :, :, :count] = grid.inverse(spectra)
+    result[1, :, :, :count] = grid.inverse(1j * grid.omega[:, None, None] * spectra)
+    result[:, :, :, count:] = free.transpose(1, 0, 2, 3)
     if plant.floats:
         _set_unconstrained(result, forward, ports, theta_forces, loads, law_forces)
     return result
@@ -83,13 +103,13 @@ def _set_unconstrained(
     law_forces: ComplexArray,
 ) -> None:
     """Columns of `port_motions` of a system that nothing holds: forces have polynomial parts, too."""
-    plant, P = forward.plant, theta_forces.shape[1]
+    plant = forward.plant
+    for j in range(law_forces.shape[1]):
+        motions[:, :, :, j] = _floating(forward, ports, ports, law_forces[:, j, :, None])[..., 0]
     for i, parameter in enumerate(forward.system.parameters):
         if i not in loads:
             unit = np.eye(len(plant.structure.H))[forward.system.elements.index(parameter.element)]
-            motions[:, :, :, i] = _floating(forward, unit[None], ports, theta_forces[:, i, None, None])[..., 0]
-    for j in range(law_forces.shape[1]):
-        motions[:, :, :, P + j] = _floating(forward, ports, ports, law_forces[:, j, :, None])[..., 0]
+            motions[:, :, :, i] += _floating(forward, unit[None], ports, theta_forces[:, i, None, None])[..., 0]
     for column, load in loads.items():
         motions[:, :, :, column] = _floating_under(forward, load, ports)
 
@@ -132,14 +152,23 @@ def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: C
 
 
 def tangent(
-    forward: Forward, forces: LawForces, motions: FloatArray, correction: SmootherCorrection | None
+    forward: Forward,
+    forces: LawForces,
+    motions: FloatArray,
+    correction: SmootherCorrection | None,
+    *,
+    fine: bool = False,
 ) -> ComplexArray:
     """Spectra (F, m, columns) of the laws' reaction to small motions along their ports.
 
     The tangent along the trajectory less the equivalent, which is part of the plant, in closed loop with the plant:
     f = s (d0 + D f) with the slopes s over time, solved for all columns at once.  Laws with memory have no
     instantaneous tangent; their equivalent is used instead.
+
+    fine: on the oversampled axis.  Stops change their slope within a sample, by far more than the plant's stiffness.
     """
+    if fine and correction is None and not forward.plant.floats:
+        return _fine_tangent(forward, forces, motions)
     plant, grid = forward.plant, forward.part.grid
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
     ports = forward.plant.structure.padded(forces.ports)
@@ -166,7 +195,37 @@ def tangent(
     return grid.forward(_gmres(close, along_d * motions[0] + along_v * motions[1]).astype(np.float64))
 
 
-def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatArray:
+def _fine_tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> ComplexArray:
+    """As `tangent`, on the oversampled axis, for one force along each distinct port."""
+    grid, plant = forward.part.grid, forward.plant
+    _, first, place = np.unique(forces.ports, axis=0, return_index=True, return_inverse=True)
+    each = np.stack([_fine_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=1).astype(np.float32)
+    slopes = np.stack([each[:, place == k].sum(axis=1) for k in range(len(first))], axis=1)[..., None]  # (2, u, 4N, 1)
+    count = OVERSAMPLING * grid.samples
+    balance = forward.harmonic_balance(np.zeros(plant.structure.states))
+    assert balance is not None, "there are laws"
+    compliance = balance.compliance[:, first[:, None], first].astype(np.complex64)
+    jw = balance.jw[:, None, None].astype(np.complex64)
+    along = CubicSpline(np.arange(grid.samples), motions[:, :, first], axis=1)(np.arange(count) / OVERSAMPLING)
+    along = along.astype(np.float32).transpose(0, 2, 1, 3)  # (2, u, 4N, columns)
+
+    def moved(force: FloatArray) -> tuple[FloatArray, FloatArray]:
+        answer = np.einsum("fab,bfc->fac", compliance, rfft(force, axis=1))
+        d, v = irfft(np.stack([answer, jw * answer]), count, axis=1)
+        return d.transpose(1, 0, 2), v.transpose(1, 0, 2)
+
+    def close(force: FloatArray) -> FloatArray:
+        d, v = moved(force)
+        return force - slopes[0] * d - slopes[1] * v
+
+    force = _gmres(close, slopes[0] * along[0] + slopes[1] * along[1], _FINE_KRYLOV)
+    d, v = moved(force)
+    d, v = (d + along[0])[place], (v + along[1])[place]
+    result = each[0][..., None] * d + each[1][..., None] * v
+    return grid.coarse_forces(result.transpose(1, 0, 2).astype(np.float64))
+
+
+def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray, krylov: int = _KRYLOV) -> FloatArray:
     """Solution x of apply(x) = right by GMRES for all last-axis columns at once (Saad and Schultz 1986)."""
     size = np.sqrt(np.sum(right**2, axis=(0, 1)))
     used = size > 0
@@ -175,10 +234,10 @@ def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> Floa
     scale = np.where(used, size, 1.0)
     basis = [right / scale]
     columns = len(scale)
-    hessenberg = np.zeros((columns, _KRYLOV + 1, _KRYLOV), right.dtype)
-    target = np.zeros((columns, _KRYLOV + 1, 1), right.dtype)
+    hessenberg = np.zeros((columns, krylov + 1, krylov), right.dtype)
+    target = np.zeros((columns, krylov + 1, 1), right.dtype)
     target[:, 0, 0] = size
-    for k in range(_KRYLOV):
+    for k in range(krylov):
         w = apply(basis[k])
         for j, v in enumerate(basis):
             h = np.einsum("nmc,nmc->c", w, v)
@@ -198,36 +257,38 @@ def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> Floa
 
 
 def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
-    """Derivatives of a law's force by deflection and rate along the trajectory, less its equivalent's, (2, N)."""
-    term = forces.terms[i]
-    grid = forward.part.grid
+    """Slopes of a law over deflection and rate, averaged over every sample, (2, N)."""
+    return _fine_slopes(forward, forces, i).reshape(2, -1, OVERSAMPLING).mean(axis=2)
+
+
+def _fine_slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
+    """Derivatives of a law's force by deflection and rate along the trajectory, less its equivalent's, (2, 4N)."""
+    term, grid = forces.terms[i], forward.part.grid
     law = term.element_law
-    if law.memory:
-        return np.zeros((2, grid.samples))
     d, v = forces.deflection[:, i], forces.rate[:, i]
+    if law.memory:
+        return np.zeros((2, len(d)))
     time = grid.start + grid.fine_time
     element = forward.element_of(term)
-    result = np.empty((2, grid.samples))
+    result = np.empty((2, len(d)))
     for k, (signal, load) in enumerate(((d, term.equivalent[0]), (v, term.equivalent[1]))):
         step = 1e-3 * float(np.std(signal)) + 1e-300
         moves = ((step, 0.0), (-step, 0.0)) if k == 0 else ((0.0, step), (0.0, -step))
         up, down = (force_along(law, term.parameters, d + a, v + b, time, element) for a, b in moves)
-        slope = ((up - down) / (2 * step)).reshape(-1, OVERSAMPLING).mean(axis=1)
-        result[k] = slope - load
+        result[k] = (up - down) / (2 * step) - load
     return result
 
 
 def law_force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:
-    i = forces.index(term)
-    grid = forward.part.grid
-    return force_along(
-        term.element_law,
-        term.parameters,
-        forces.deflection[:, i],
-        forces.rate[:, i],
-        grid.start + grid.fine_time,
-        forward.element_of(term),
-    )
+    """Force of a law along the present trajectory, (4N,)."""
+    return _force_of(forward, term, forces, forces.index(term), forward.element_of(term))
+
+
+def _force_of(forward: Forward, term: Term, forces: LawForces, port: int, element: SpringDamper) -> FloatArray:
+    """Force of a law beside a spring and damper along the present trajectory, (4N,)."""
+    time = forward.part.grid.start + forward.part.grid.fine_time
+    d, v = forces.deflection[:, port], forces.rate[:, port]
+    return force_along(term.element_law, term.parameters, d, v, time, element)
 
 
 class SmootherCorrection:

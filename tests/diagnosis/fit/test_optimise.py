@@ -33,8 +33,8 @@ def test_a_fit_is_never_worse_than_any_point_that_it_saw(
     seen = []
     whole = module._state
 
-    def recorded(*args: Any) -> module._State:
-        seen.append(whole(*args))
+    def recorded(*args: Any, **kwargs: Any) -> module._State:
+        seen.append(whole(*args, **kwargs))
         return seen[-1]
 
     monkeypatch.setattr(module, "_state", recorded)
