@@ -76,9 +76,12 @@ class Linearised:
 
     @property
     def may_be_finer(self) -> bool:
-        """Whether there are laws whose reaction is not that on the oversampled axis yet."""
-        beside = self.forces is not None and not self.problem.process_noise and not self.forward.plant.floats
-        return beside and not self.fine
+        """Whether the reaction of the laws is not that on the oversampled axis yet, and would be better there.
+
+        Friction that turns within a sample has no slope on either axis.
+        """
+        forces = None if self.problem.process_noise or self.forward.plant.floats else self.forces
+        return not self.fine and forces is not None and all(one.element_law.corner is None for one in forces.terms)
 
     @property
     def jacobian(self) -> FloatArray:
@@ -171,9 +174,10 @@ def _of_theta(
         slopes[:P] = _log_det_slopes(forward, whitener)
     laws = 0 if forces is None else len(forces.terms)
     law_forces = np.zeros((len(forward.part.grid.omega), P + p, laws), dtype=complex)
-    for i, port, change in () if forces is None else law_change_by_element(forward, forces):
-        law_forces[:, i, port] = change
-        packed.add_port(i, forces.ports[port], change)
+    if forces is not None:
+        for i, port, change in law_change_by_element(forward, forces):
+            law_forces[:, i, port] = change
+            packed.add_port(i, forces.ports[port], change)
     return _Sensitivities(packed, theta_forces, loads, law_forces, slopes)
 
 

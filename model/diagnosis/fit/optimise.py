@@ -247,7 +247,7 @@ def _begun_anew(problem: Problem, state: _State, below: float = np.inf) -> _Stat
     step = np.linalg.lstsq(columns, residual, rcond=None)[0]
     if float(np.sum((columns @ step) ** 2)) < _HOPEFUL * (state.value - below):
         return state
-    other = _state(problem, replace(state.point, state=state.point.state + step), state.working)
+    other = _state(problem, replace(state.point, state=state.point.state + step), state.working, fine=state.lin.fine)
     return other if other.value < state.value else state
 
 

@@ -205,23 +205,19 @@ def _fine_tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> C
     balance = forward.harmonic_balance(np.zeros(plant.structure.states))
     assert balance is not None, "there are laws"
     compliance = balance.compliance[:, first[:, None], first].astype(np.complex64)
-    jw = balance.jw[:, None, None].astype(np.complex64)
+    jw = balance.jw[:, None].astype(np.complex64)
     along = CubicSpline(np.arange(grid.samples), motions[:, :, first], axis=1)(np.arange(count) / OVERSAMPLING)
     along = along.astype(np.float32).transpose(0, 2, 1, 3)  # (2, u, 4N, columns)
 
-    def moved(force: FloatArray) -> tuple[FloatArray, FloatArray]:
-        answer = np.einsum("fab,bfc->fac", compliance, rfft(force, axis=1))
-        d, v = irfft(np.stack([answer, jw * answer]), count, axis=1)
-        return d.transpose(1, 0, 2), v.transpose(1, 0, 2)
+    def moved(force: FloatArray) -> FloatArray:
+        answer = np.einsum("fab,bfc->afc", compliance, rfft(force, axis=1))
+        return np.asarray(irfft(np.stack([answer, jw * answer]), count, axis=2))
 
     def close(force: FloatArray) -> FloatArray:
-        d, v = moved(force)
-        return force - slopes[0] * d - slopes[1] * v
+        return np.asarray(force - np.sum(slopes * moved(force), axis=0))
 
-    force = _gmres(close, slopes[0] * along[0] + slopes[1] * along[1], _FINE_KRYLOV)
-    d, v = moved(force)
-    d, v = (d + along[0])[place], (v + along[1])[place]
-    result = each[0][..., None] * d + each[1][..., None] * v
+    force = _gmres(close, np.sum(slopes * along, axis=0), _FINE_KRYLOV)
+    result = np.sum(each[..., None] * (along + moved(force))[:, place], axis=0)
     return grid.coarse_forces(result.transpose(1, 0, 2).astype(np.float64))
 
 
@@ -258,7 +254,8 @@ def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray, krylov:
 
 def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
     """Slopes of a law over deflection and rate, averaged over every sample, (2, N)."""
-    return _fine_slopes(forward, forces, i).reshape(2, -1, OVERSAMPLING).mean(axis=2)
+    found: FloatArray = _fine_slopes(forward, forces, i).reshape(2, -1, OVERSAMPLING).mean(axis=2)
+    return found
 
 
 def _fine_slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
