@@ -22,7 +22,7 @@ from sprung.benchmarks.generator.laws import LAWS
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.system import System, load_system
 from sprung.replay.record import Record, load_record
-from sprung.service.report import write_report
+from sprung.service.report.writing import write_report
 
 Array = NDArray[np.float64]
 Model = tuple[float, float, float, Callable[[float, float], float]]  # mass, damping, stiffness, force of the laws

@@ -14,11 +14,11 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import butter, freqs_zpk
 
 from sprung.model.ambient.response import Responses
 from sprung.model.ambient.sensing import sensing
 from sprung.model.schema import MotionSensor, SupportInput
+from sprung.model.signal_filters import analog_bandpass
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -60,8 +60,8 @@ W_B = Weighting(16.0, 0.55, 2.5, 0.9, 4.0, 0.95, 1.024)  # ISO 2631-4, EN 12299
 
 def running_band(omega: FloatArray) -> np.ndarray:
     """Band-pass of EN 14363 for accelerations in the body, 24 dB per octave."""
-    zeros, poles, gain = butter(4, [2 * np.pi * f for f in BAND], "bandpass", analog=True, output="zpk")
-    return np.asarray(freqs_zpk(zeros, poles, gain, omega)[1])
+    low, high = BAND
+    return analog_bandpass(4, 2 * np.pi * low, 2 * np.pi * high, omega)
 
 
 def weighted(values: FloatArray, rate: float, weighting) -> FloatArray:  # type: ignore[no-untyped-def]

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from sprung.model.signals import FloatArray
 
 Coefficients = Sequence[float] | FloatArray
@@ -40,19 +42,41 @@ def lfilter_zi(numerator: Coefficients, denominator: Coefficients) -> FloatArray
     return found
 
 
-def firwin(taps: int, cutoff: float, window: Any) -> FloatArray:
-    """A low-pass of linear phase, its taps (N,); cutoff: in half the sample rate."""
-    found: FloatArray = _signal().firwin(taps, cutoff, window=window)
+def firwin(taps: int, cutoff: float, window: Any, rate: float = 2.0) -> FloatArray:
+    """A low-pass of linear phase, its taps (N,).
+
+    cutoff: in the unit of `rate`, the sample rate; left out, in half of that.
+    """
+    found: FloatArray = _signal().firwin(taps, cutoff, window=window, fs=rate)
     return found
 
 
-def upfirdn(taps: FloatArray, series: FloatArray, down: int) -> FloatArray:
-    """A series through a filter, of which one sample of `down` is kept."""
-    found: FloatArray = _signal().upfirdn(taps, series, down=down)
+def kaiserord(attenuation: float, width: float) -> tuple[int, float]:
+    """Taps and shape of a Kaiser window; attenuation: dB, width: of the transition, in half the sample rate."""
+    taps, beta = _signal().kaiserord(attenuation, width)
+    return int(taps), float(beta)
+
+
+def upfirdn(taps: FloatArray, series: FloatArray, up: int = 1, down: int = 1) -> FloatArray:
+    """A series at `up` times its rate through a filter, of which one sample of `down` is kept."""
+    found: FloatArray = _signal().upfirdn(taps, series, up, down)
     return found
 
 
 def tukey(samples: int, edge: float) -> FloatArray:
     """A window (samples,) with cosines at both ends, together the share `edge` of it."""
     found: FloatArray = _signal().windows.tukey(samples, edge)
+    return found
+
+
+def analog_bandpass(order: int, low: float, high: float, omega: FloatArray) -> np.ndarray:
+    """The response of a Butterworth band-pass at angular frequencies (F,); low, high: its edges, rad/s."""
+    zeros, poles, gain = _signal().butter(order, [low, high], "bandpass", analog=True, output="zpk")
+    found: np.ndarray = _signal().freqs_zpk(zeros, poles, gain, omega)[1]
+    return found
+
+
+def welch(series: FloatArray, **how: Any) -> tuple[FloatArray, FloatArray]:
+    """Frequencies and power spectral density of a series, as `scipy.signal.welch` has them."""
+    found: tuple[FloatArray, FloatArray] = _signal().welch(series, **how)
     return found

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from cantools.database import Database
-from scipy.signal import welch
 
+from sprung.model.signal_filters import welch
 from sprung.model.signals import ANY_TIME, FloatArray, IntArray, TimeColumn
 from sprung.replay.account import Account
 from sprung.replay.listing import NO_TIME, signals_of

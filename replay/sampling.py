@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.signal import firwin, kaiserord, upfirdn
 
+from sprung.model.signal_filters import firwin, kaiserord, upfirdn
 from sprung.model.signals import Channel, FloatArray, IntArray, SampleBlock
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.grid import SLOWEST
@@ -228,7 +228,7 @@ def low_pass(up: int, down: int, own_over_grid: float) -> FloatArray:
     rate = up * own_over_grid  # in grid rates
     length, beta = kaiserord(ATTENUATION, (STOP - PASS) / (rate / 2))
     half = -(-(length // 2 + 1) // down) * down
-    taps = firwin(2 * half + 1, (PASS + STOP) / 2, window=("kaiser", beta), fs=rate)
+    taps = firwin(2 * half + 1, (PASS + STOP) / 2, window=("kaiser", beta), rate=rate)
     return np.asarray(taps * up, dtype=np.float64)
 
 

@@ -25,7 +25,7 @@ from sprung.replay.recording import Recording
 from sprung.service.can_database import database_of
 from sprung.service.monitoring.engine import Engine, make_tracker
 from sprung.service.monitoring.following import FollowedVehicle
-from sprung.service.report import write_report
+from sprung.service.report.writing import write_report
 from sprung.service.sources.opening import open_record, open_stream
 from sprung.service.sources.reading import windower_of
 from sprung.service.times import now_ns

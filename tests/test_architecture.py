@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 OURS = ("model", "replay", "service", "benchmarks")
 MAY_IMPORT = {
     "model": {"model"},
-    "replay": {"replay", "model.signals", "model.text", "model.units"},
+    "replay": {"replay", "model.signals", "model.signal_filters", "model.text", "model.units"},
     "service": {"service", "model", "replay", "benchmarks"},
     "benchmarks": {"benchmarks", "model", "replay", "service"},
 }

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import typer
 
 from sprung.model.text import one_line
+from sprung.service.processes.imports import python_can_alone
 
 USAGE = 2
 INTERRUPTED = 130
@@ -19,6 +20,7 @@ INTERRUPTED = 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; never a traceback, unless SPRUNG_DEBUG is set."""
     _usable_streams()
+    python_can_alone()
     logging.basicConfig(format="sprung: %(message)s")  # warnings; a service sets up logs of its own
     from sprung.service.cli.app import app
 

@@ -11,6 +11,7 @@ from sprung import __version__
 from sprung.service.cli import fleet_commands, store_commands
 from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, vehicle_name
 from sprung.service.cli.plain import PlainTyper
+from sprung.service.processes.imports import lasting_imports
 from sprung.service.processes.threads import hand_over_often, one_thread_each
 
 app = PlainTyper(
@@ -123,7 +124,8 @@ def serve(
     On an embedded store unless --store says otherwise.
     """
     one_thread_each()
-    from sprung.service.cli.serve import run
+    with lasting_imports():
+        from sprung.service.cli.serve import run
 
     options = {
         "system": system,

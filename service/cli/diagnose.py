@@ -57,7 +57,7 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: DiagnoseO
         print(f"sprung: {file}: {error}", file=sys.stderr)
         return 1
     if asked.out is not None:
-        from sprung.service.report import write_report
+        from sprung.service.report.writing import write_report
 
         files = write_report(report, system, asked.out)
         if not json_lines:

@@ -38,7 +38,7 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     from sprung.model.diagnosis.rules import RULES
     from sprung.model.work import WorkBudget
     from sprung.service.diagnosis.improved import write_improved
-    from sprung.service.report import write_report
+    from sprung.service.report.writing import write_report
 
     latest, begun = Stage(0.0, "reading"), time.monotonic()
 

@@ -1,10 +1,12 @@
-"""Importing much at once."""
+"""Importing much at once, and what is imported for nothing."""
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import ModuleType
 
 
 @contextmanager
@@ -21,3 +23,24 @@ def lasting_imports() -> Iterator[None]:
         gc.freeze()
         if collecting:
             gc.enable()
+
+
+class _PythonCanAlone:
+    """Refuses asammdf to python-can, and to nobody else."""
+
+    def find_spec(self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> None:
+        """Asked for every module that is imported."""
+        if name == "asammdf":
+            asking = sys.modules.get("can.io.mf4")
+            if asking is not None and not hasattr(asking, "MF4Reader"):  # it is just being imported, and asks whether
+                raise ModuleNotFoundError("python-can reads no MDF files here", name=name)
+
+
+def python_can_alone() -> None:
+    """In a process of Sprung's own: let python-can do without asammdf.
+
+    It imports that, where it is installed, for readers of its own that nothing here uses: with pandas and a second of
+    processor time, in every process that reads a recording.
+    """
+    if not any(isinstance(one, _PythonCanAlone) for one in sys.meta_path):
+        sys.meta_path.insert(0, _PythonCanAlone())

@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
 
 from sprung.service.errors import UserError
+from sprung.service.processes.imports import python_can_alone
 
 log = logging.getLogger("sprung.worker")
 
@@ -183,12 +184,13 @@ class _Tether:
 
 
 def tie(parent: int) -> int:
-    """Have the kernel end this process with its parent, where it can; returns the parent."""
+    """Have the kernel end this process, one of Sprung's own, with its parent, where it can; returns the parent."""
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):
             ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:  # it died before we asked
         os._exit(1)
+    python_can_alone()
     return parent
 
 

@@ -25,7 +25,7 @@ def inline(path: Path) -> str:
 
 
 def render(report: Report, pictures: Mapping[str, Path], laws: words.Laws) -> str:
-    """The page; pictures are keyed as `service.report.draw_pictures` names them, laws are those that were tried."""
+    """The page; pictures are keyed as `writing.draw_pictures` names them, laws are those that were tried."""
     inside = {key: inline(path) for key, path in pictures.items()}
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=False)
     return environment.from_string((TEMPLATES / "report.html").read_text("utf-8")).render(

@@ -23,7 +23,7 @@ from sprung.service.core import Core, build_core
 from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.monitoring.engine import Engine
 from sprung.service.processes.worker import Emit
-from sprung.service.report import write_report
+from sprung.service.report.writing import write_report
 from sprung.service.settings import Settings
 from sprung.service.store.circumstances import WindowCircumstances, add_circumstances
 from sprung.service.store.schema import fleet_status

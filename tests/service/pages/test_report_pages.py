@@ -14,10 +14,11 @@ from sprung.model.diagnosis.report.report import (
     LawParameter,
 )
 from sprung.model.system import load_system
-from sprung.service.report import words, write_report
+from sprung.service.report import words
 from sprung.service.report.drawing import draw_system
 from sprung.service.report.layout import lay_out
 from sprung.service.report.values import largest_bias
+from sprung.service.report.writing import write_report
 from tests.report_made import SYSTEM, friction_report
 
 

@@ -1,0 +1,61 @@
+"""A mismatch report as a page and its pictures."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from sprung.model.diagnosis.report.report import Report
+from sprung.model.system import System
+from sprung.service.report import drawing, forces, ink, signals, values, words
+from sprung.service.report.page import render
+
+
+@dataclass(frozen=True)
+class ReportFiles:
+    """What was written."""
+
+    page: Path
+    data: Path
+    pictures: dict[str, Path]
+
+
+def draw_pictures(report: Report, system: System, folder: Path) -> dict[str, Path]:
+    """Every picture for which the report has the arrays, as PNG files in `folder`."""
+    findings = {f.location: words.finding_words(f, system.catalogue) for f in report.findings}
+    units = {channel.name: channel.unit for channel in system.channels}
+    figures: dict[str, Figure | None] = {
+        "system": drawing.draw_system(system, findings, report.localization),
+        "fit": signals.fit_figure(report, system.sensors, tuple(units[s] for s in system.sensors), system.sample_rate),
+        "sensors": signals.sensor_figure(report),
+        "locations": values.location_figure(report),
+        "parameters": values.parameter_figure(report),
+    }
+    for number in range(len(report.findings)):
+        figures[f"force_{number}"] = forces.force_figure(report, number)
+        figures[f"residual_{number}"] = forces.residual_figure(report, number)
+    return {key: ink.save(f, folder / f"{key}.png") for key, f in figures.items() if f is not None}
+
+
+def write_report(report: Report, system: System, folder: Path) -> ReportFiles:
+    """Writes report.html, report.json and the pictures into `folder`, which is made if absent.
+
+    >>> import pathlib, sprung
+    >>> rig = sprung.load_system("rig.yaml")
+    >>> report = sprung.diagnose(rig, sprung.load_record("rig.csv", rig))
+    >>> files = sprung.write_report(report, rig, pathlib.Path("report"))
+    >>> files.page.name, "fit" in files.pictures
+    ('report.html', True)
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = draw_pictures(report, system, folder)
+    page, data = folder / "report.html", folder / "report.json"
+    page.write_text(render(report, pictures, system.catalogue), encoding="utf-8")
+    data.write_text(json.dumps(report.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
+    return ReportFiles(page, data, pictures)
+
+
+__all__ = ["ReportFiles", "draw_pictures", "write_report"]
