@@ -26,17 +26,33 @@ Rows = list[dict[str, Any]]
 
 def read_rows(folder: Path) -> Rows:
     """Rows that were kept.  Errors: `ValueError` naming those that other code made than what stands here."""
-    found = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob("*.json"))]
-    found = [row for row in found if "unfinished" not in row]
-    stale = sorted({f"{row['task']} {name_of(row)}" for row in found if not is_current(row)})
-    if stale:
+    found = _all_rows(folder)
+    if stale := _stale(found):
         raise ValueError(f"{folder}: rows of other code than this: {', '.join(stale)}; run them again or remove them")
     return found
 
 
+def _all_rows(folder: Path) -> Rows:
+    found = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob("*.json"))]
+    return [row for row in found if "unfinished" not in row]
+
+
+def _stale(rows: Rows) -> list[str]:
+    """Task and method of rows that other code made than what stands here."""
+    return sorted({f"{row['task']} {name_of(row)}" for row in rows if not is_current(row)})
+
+
 def refresh(folder: Path, document: Path, only: list[str] | None = None) -> list[dict[str, Any]]:
-    """Write the document's places and its pictures, or `only` places of these kinds or markers."""
-    found = read_rows(folder)
+    """Write the document's places and its pictures, or `only` places of these kinds or markers.
+
+    Places of tasks with rows of other code stay as they stand, and are told with these rows.  Errors: `ValueError`
+    where no task is left.
+    """
+    found = _all_rows(folder)
+    of_other_code = {task: _stale([row for row in found if row["task"] == task]) for task in {r["task"] for r in found}}
+    found = [row for row in found if not of_other_code[row["task"]]]
+    if not found:
+        read_rows(folder)
     filled: list[dict[str, Any]] = []
 
     def fill(match: re.Match[str]) -> str:
@@ -44,6 +60,8 @@ def refresh(folder: Path, document: Path, only: list[str] | None = None) -> list
         marker = kind if task is None else f"{kind} {task}"
         rows = found if task is None else [row for row in found if row["task"] == task]
         wanted = only is None or kind in only or marker in only
+        if wanted and kind in KINDS and (stale := of_other_code.get(task or "")):
+            filled.append({"place": marker, "rows_of_other_code": stale, "changed": False})
         if not wanted or kind not in KINDS or (task is not None and not rows):
             return match[0]
         text = KINDS[kind](task or "", rows, folder, before)

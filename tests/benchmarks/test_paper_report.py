@@ -95,6 +95,17 @@ def test_rows_of_other_code_are_refused(tmp_path: Path) -> None:
         list(paper_report.run(tmp_path, document))
 
 
+def test_tasks_with_rows_of_other_code_stay_as_they_stand(tmp_path: Path) -> None:
+    keep(tmp_path, "alps", 0, SE=1.0, PE=1.0)
+    keep(tmp_path, "alps", 1, task="train", SE=1.0, sources="other")
+    document = tmp_path / "paper.md"
+    document.write_text(PAGE)
+    told = {row["place"]: row for row in paper_report.run(tmp_path, document, only="rows")}
+    assert told["rows pendulum"]["changed"]
+    assert told["rows train"] == {"place": "rows train", "rows_of_other_code": ["train alps"], "changed": False}
+    assert "<!-- rows train -->\nas it was\n<!-- end -->" in document.read_text()
+
+
 def test_a_method_that_is_worse_on_every_seed_is_distinguished_from_one_that_is_worse_on_one(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for seed in range(3):
