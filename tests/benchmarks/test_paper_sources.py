@@ -124,6 +124,11 @@ def test_rows_of_the_training_reach_what_trains_them() -> None:
     assert ("sprung.model.identification.training", "training_benefit") not in reached
 
 
+def test_the_trains_vehicle_has_no_law_that_its_rows_would_depend_on() -> None:
+    root = Path(paper.__file__).resolve().parent.parent
+    assert "law" not in (root / paper_sources.FILES["train"][0]).read_text()
+
+
 def test_code_that_makes_the_same_rows_ends_with_the_next_change(monkeypatch: pytest.MonkeyPatch) -> None:
     row = {"task": "pendulum", "budget": "quick", "sources": "old"}
     assert not is_current(row) and is_current(row | {"sources": sources("pendulum")})
