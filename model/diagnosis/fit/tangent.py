@@ -19,6 +19,7 @@ from sprung.model.laws.basis import StaticLaw
 from sprung.model.signals import FloatArray
 
 _KRYLOV, _FINE_KRYLOV, _KRYLOV_TOLERANCE = 16, 60, 3e-3
+_BLOCK = 8  # columns that are solved for together on the oversampled axis, which bounds the memory
 _RELATIVE_STEP = 1e-4  # of finite differences
 
 
@@ -200,14 +201,13 @@ def _fine_tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> C
     grid, plant = forward.part.grid, forward.plant
     _, first, place = np.unique(forces.ports, axis=0, return_index=True, return_inverse=True)
     each = np.stack([_fine_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=1).astype(np.float32)
-    slopes = np.stack([each[:, place == k].sum(axis=1) for k in range(len(first))], axis=1)[..., None]  # (2, u, 4N, 1)
+    each = each[..., None]  # (2, m, 4N, 1)
+    slopes = np.stack([each[:, place == k].sum(axis=1) for k in range(len(first))], axis=1)  # (2, u, 4N, 1)
     count = OVERSAMPLING * grid.samples
     balance = forward.harmonic_balance(np.zeros(plant.structure.states))
     assert balance is not None, "there are laws"
     compliance = balance.compliance[:, first[:, None], first].astype(np.complex64)
     jw = balance.jw[:, None].astype(np.complex64)
-    along = CubicSpline(np.arange(grid.samples), motions[:, :, first], axis=1)(np.arange(count) / OVERSAMPLING)
-    along = along.astype(np.float32).transpose(0, 2, 1, 3)  # (2, u, 4N, columns)
 
     def moved(force: FloatArray) -> FloatArray:
         answer = np.einsum("fab,bfc->afc", compliance, rfft(force, axis=1))
@@ -216,9 +216,15 @@ def _fine_tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> C
     def close(force: FloatArray) -> FloatArray:
         return np.asarray(force - np.sum(slopes * moved(force), axis=0))
 
-    force = _gmres(close, np.sum(slopes * along, axis=0), _FINE_KRYLOV)
-    result = np.sum(each[..., None] * (along + moved(force))[:, place], axis=0)
-    return grid.coarse_forces(result.transpose(1, 0, 2).astype(np.float64))
+    def reaction(motion: FloatArray) -> ComplexArray:
+        spline = CubicSpline(np.arange(grid.samples), motion[:, :, first], axis=1)
+        along = spline(np.arange(count) / OVERSAMPLING).astype(np.float32).transpose(0, 2, 1, 3)  # (2, u, 4N, columns)
+        force = _gmres(close, np.sum(slopes * along, axis=0), _FINE_KRYLOV)
+        result = np.sum(each * (along + moved(force))[:, place], axis=0)
+        return grid.coarse_forces(result.transpose(1, 0, 2).astype(np.float64))
+
+    columns = motions.shape[3]
+    return np.concatenate([reaction(motions[..., at : at + _BLOCK]) for at in range(0, columns, _BLOCK)], axis=2)
 
 
 def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray, krylov: int = _KRYLOV) -> FloatArray:
