@@ -50,5 +50,5 @@ def descendants(pid: int) -> list[RunningProcess]:
 
 
 def busy_seconds() -> float:
-    """Processor time of this process and of all below it, so far."""
-    return sum(os.times()[:2]) + sum(one.seconds for one in descendants(os.getpid()))
+    """Processor time of this process and of all below it, so far, with those that have ended."""
+    return sum(os.times()[:4]) + sum(one.seconds for one in descendants(os.getpid()))

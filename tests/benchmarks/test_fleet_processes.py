@@ -20,3 +20,4 @@ def test_what_a_child_takes_is_counted_while_it_runs() -> None:
     assert busy_seconds() - before >= 0.28
     child.communicate("\n")
     assert child.pid not in [one.pid for one in descendants(os.getpid())]
+    assert busy_seconds() - before >= 0.28  # also when it has ended
