@@ -168,7 +168,7 @@ def tangent(
 
     fine: on the oversampled axis.  Stops change their slope within a sample, by far more than the plant's stiffness.
     """
-    if fine and correction is None and not forward.plant.floats:
+    if fine and correction is None and not forward.plant.floats and np.isfinite(motions).all():
         return _fine_tangent(forward, forces, motions)
     plant, grid = forward.plant, forward.part.grid
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
