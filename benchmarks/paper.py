@@ -112,8 +112,7 @@ def _keep(settings: PaperSettings, row: dict[str, Any]) -> None:
     """Write a row beside the checkpoints, for `benchmarks.paper_report`."""
     folder = settings.out / settings.budget / "rows"
     folder.mkdir(parents=True, exist_ok=True)
-    what = row.get("method") or f"{row.get('inputs')}-inputs"
-    path = folder / f"{row['task']}-{what}-s{settings.seed}.json"
+    path = folder / f"{paper_settings.row_name(row, settings.seed)}.json"
     path.write_text(json.dumps(row, indent=1) + "\n")
 
 

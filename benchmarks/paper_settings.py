@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sprung.model.alps.config import Budget
 from sprung.model.alps.fit import TimeLimit
@@ -49,3 +50,9 @@ class PaperSettings:
             return True
         named = self.method.split(",")
         return method in named or (CORE in named and method not in EXTRA)
+
+
+def row_name(row: dict[str, Any], seed: int) -> str:
+    """What the file of a row is called, and that of its errors."""
+    what = row.get("method") or f"{row.get('inputs')}-inputs"
+    return f"{row['task']}-{what}-s{seed}"

@@ -22,6 +22,7 @@ import numpy as np
 
 from sprung.benchmarks.paper_report.document import read_rows
 from sprung.benchmarks.paper_report.tables import name_of
+from sprung.benchmarks.paper_settings import row_name
 from sprung.service.errors import UserError
 
 ARCHIVE = Path(__file__).resolve().parent.parent.parent / "docs" / "paper-rows.zip"
@@ -67,7 +68,7 @@ def run(
     files = _read(place)
     told: dict[tuple[str, str], list[int]] = {}
     for row in chosen:
-        name = f"{row['task']}-{row.get('method') or str(row['inputs']) + '-inputs'}-s{row.get('seed', 0)}"
+        name = row_name(row, row.get("seed", 0))
         files[f"{kept}/rows/{name}.json"] = (json.dumps(row) + "\n").encode()
         errors = data / "errors" / f"{name}.npz"
         if errors.is_file():

@@ -117,9 +117,8 @@ def settled(problem: Problem, fit: Fit) -> Fit:
     return fit
 
 
-def settled_and_refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
-    """Noise levels at a fit, which is continued beside them until it converges, and the levels at its end."""
-    problem, fit = refreshed(problem, fit)
+def finished(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """An unconverged fit, continued, and the noise levels at its end; not where unmeasured forces take its misfit."""
     if fit.converged or problem.process_noise:
         return problem, fit
     return refreshed(problem, settled(problem, fit))

@@ -12,6 +12,7 @@ from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces
+from sprung.model.diagnosis.response.newton import central_slopes
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
@@ -46,14 +47,14 @@ def law_change_by_element(forward: Forward, forces: LawForces) -> Iterator[tuple
 
     Of laws whose force depends on the spring or damper of their element, as that of a valve does.
     """
-    names = [term.location.partition("|")[0] for term in forces.terms]
-    for i, parameter in enumerate(forward.system.parameters):
-        for port, term in enumerate(forces.terms):
-            if names[port] != parameter.element or parameter.quantity == "mass":
+    for port, term in enumerate(forces.terms):
+        element = term.location.partition("|")[0]
+        own, present = forward.element_of(term), law_force(forward, term, forces)
+        for i, parameter in enumerate(forward.system.parameters):
+            if parameter.element != element or parameter.quantity == "mass":
                 continue
-            own = forward.element_of(term)
             more = own._replace(**{parameter.quantity: getattr(own, parameter.quantity) * np.exp(_RELATIVE_STEP)})
-            change = _force_of(forward, term, forces, port, more) - _force_of(forward, term, forces, port, own)
+            change = _force_of(forward, term, forces, port, more) - present
             if np.any(change):
                 yield i, port, forward.part.grid.coarse_forces(change / _RELATIVE_STEP)
 
@@ -273,13 +274,8 @@ def _fine_slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
         return np.zeros((2, len(d)))
     time = grid.start + grid.fine_time
     element = forward.element_of(term)
-    result = np.empty((2, len(d)))
-    for k, (signal, load) in enumerate(((d, term.equivalent[0]), (v, term.equivalent[1]))):
-        step = 1e-3 * float(np.std(signal)) + 1e-300
-        moves = ((step, 0.0), (-step, 0.0)) if k == 0 else ((0.0, step), (0.0, -step))
-        up, down = (force_along(law, term.parameters, d + a, v + b, time, element) for a, b in moves)
-        result[k] = (up - down) / (2 * step) - load
-    return result
+    by_d, by_v = central_slopes(lambda a, b: force_along(law, term.parameters, d + a, v + b, time, element), d, v)
+    return np.stack([by_d - term.equivalent[0], by_v - term.equivalent[1]])
 
 
 def law_force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.baseline import refreshed, settled
+from sprung.model.diagnosis.fit.baseline import finished, refreshed
 from sprung.model.diagnosis.fit.misfit import is_gross
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.calibration import (
@@ -215,8 +215,7 @@ def _refitted(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple
         problem, fit = refreshed(problem, sharp)
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
-    if not fit.converged and not problem.process_noise:
-        problem, fit = refreshed(problem, settled(problem, fit))
+    problem, fit = finished(problem, fit)
     return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise)), trial
 
 

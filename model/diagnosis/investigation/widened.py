@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.baseline import settled_and_refreshed
+from sprung.model.diagnosis.fit.baseline import finished, refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, falling, try_optimise
 from sprung.model.diagnosis.investigation.minor import untried
 from sprung.model.diagnosis.investigation.state import Investigation, TriedWider, WidenedFit
@@ -89,7 +89,7 @@ def adopt_wider(state: Investigation, wide: WidenedFit) -> Investigation:
 
 def with_model(state: Investigation, fit: Fit) -> Investigation:
     """The investigation with another fit as its model, noise levels estimated and the residual screened anew."""
-    problem, fit = settled_and_refreshed(state.problem, fit)
+    problem, fit = finished(*refreshed(state.problem, fit))
     last = screen(problem, fit, state.problem.system.catalogue, state.options.project)
     return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise), last=last)
 

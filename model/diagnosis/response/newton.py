@@ -13,6 +13,7 @@ and the frequency response.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy.linalg import expm
@@ -65,11 +66,27 @@ def _slopes(
     Laws with memory have no instantaneous slope; their equivalent linearisation is used instead.
     """
     by_d, by_v = np.zeros_like(d), np.zeros_like(v)
-    h = _STEP * d.std(axis=0) + 1e-300, _STEP * v.std(axis=0) + 1e-300
     for i in memoryless:
-        by_d[:, i] = (balance.law_force(i, d + h[0], v) - balance.law_force(i, d - h[0], v)) / (2 * h[0][i])
-        by_v[:, i] = (balance.law_force(i, d, v + h[1]) - balance.law_force(i, d, v - h[1])) / (2 * h[1][i])
+        force = partial(_moved_force, balance, i, d, v)
+        by_d[:, i], by_v[:, i] = central_slopes(force, d[:, i], v[:, i])
     return by_d, by_v
+
+
+def _moved_force(
+    balance: HarmonicBalance, index: int, d: FloatArray, v: FloatArray, by_d: float, by_v: float
+) -> FloatArray:
+    return balance.law_force(index, d + by_d, v + by_v)
+
+
+def central_slopes(
+    force: Callable[[float, float], FloatArray], deflection: FloatArray, rate: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Slopes of a force over deflection and rate along a motion, each (T,), by central differences.
+
+    force: along the motion with offsets to its deflection and rate, (T,).
+    """
+    d, v = (_STEP * float(np.std(motion)) + 1e-300 for motion in (deflection, rate))
+    return (force(d, 0.0) - force(-d, 0.0)) / (2 * d), (force(0.0, v) - force(0.0, -v)) / (2 * v)
 
 
 def _first_order_hold(A: FloatArray, B: FloatArray, step: float) -> FirstOrderHold:
