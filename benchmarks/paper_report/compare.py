@@ -13,7 +13,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from sprung.benchmarks.paper_report.comparisons import FIGURES, compare, p_over_seeds
+from sprung.benchmarks.paper_report.comparisons import FIGURES, compare, compare_by_seed
 from sprung.benchmarks.paper_report.kept import opened
 from sprung.benchmarks.paper_sources import MADE_BY
 from sprung.service.errors import UserError
@@ -60,30 +60,18 @@ def _by_trajectory(folder: Path, task: str, method: str, over: str) -> list[dict
 
 
 def _by_seed(folder: Path, task: str, method: str, over: str, figure: str) -> list[dict[str, Any]]:
-    one, other = (_values(folder, task, name, figure) for name in (method, over))
-    seeds = sorted(one.keys() & other.keys())
-    if not seeds:
+    rows = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob(f"{task}-*.json"))]
+    found = compare_by_seed(rows, task, method, over, figure)
+    if found is None:
         return []
-    above, below = ([values[seed] for seed in seeds] for values in (one, other))
-    ratios = [a / b for a, b in zip(above, below, strict=True) if b]
-    p = p_over_seeds(ratios) if len(ratios) == len(seeds) and min(ratios) > 0 else None
     return [
         {
-            "figure": figure, "seeds": seeds, "values": above, "values_over": below,
-            "ratio": _rounded(sum(above) / sum(below)) if sum(below) else None,
-            "by_seed": [_rounded(ratio) for ratio in ratios], "p_seeds": None if p is None else _rounded(p),
+            "figure": figure, "seeds": list(found.seeds), "values": list(found.values),
+            "values_over": list(found.values_over), "ratio": None if found.ratio is None else _rounded(found.ratio),
+            "by_seed": [_rounded(ratio) for ratio in found.by_seed],
+            "p_seeds": None if found.p_seeds is None else _rounded(found.p_seeds),
         }
     ]  # fmt: skip
-
-
-def _values(folder: Path, task: str, method: str, figure: str) -> dict[int, float]:
-    """A figure of a method's rows by seed."""
-    found = {}
-    for path in sorted((folder / "rows").glob(f"{task}-{method}-s*.json")):
-        row = json.loads(path.read_text())
-        if isinstance(row.get(figure), (int, float)):
-            found[int(row["seed"])] = row[figure]
-    return found
 
 
 def _rounded(value: float) -> float:

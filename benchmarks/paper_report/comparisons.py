@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -22,6 +23,7 @@ AS_PRINTED = (("autoencoder_plain", "autoencoder"), ("cdm_plain", "cdm"))  # ove
 DRAWS = 2000  # of the bootstrap
 
 TrajectoryErrors = dict[str, np.ndarray]  # figure: (R,)
+Rows = Sequence[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,18 @@ class MethodComparison:
     by_seed: tuple[float, ...]  # ratio of the means of each seed
     p: float  # Wilcoxon's signed-rank test, paired by trajectory, two-sided
     p_seeds: float | None  # Student's test of the logarithm of `by_seed`; None: a single seed, or no difference at all
+
+
+@dataclass(frozen=True)
+class SeedComparison:
+    """Any figure of the rows of one method over that of another, paired by seed."""
+
+    seeds: tuple[int, ...]  # that both have
+    values: tuple[float, ...]
+    values_over: tuple[float, ...]
+    ratio: float | None  # of the means; None: the other is zero
+    by_seed: tuple[float, ...]  # without seeds where the other is zero
+    p_seeds: float | None  # as in `MethodComparison`; None also where a figure is not positive
 
 
 def comparisons(task: str, errors: Path, best: str = "alps") -> str:
@@ -71,6 +85,48 @@ def comparisons_of_pairs(task: str, errors: Path, pairs: Sequence[tuple[str, str
         for pair, one in found.items():
             lines.append(line(*pair, key, _ratio(one), _each(one), *corrected[" ".join(pair)]))
     return "\n".join(lines)
+
+
+def comparisons_of_tasks(rows: Rows, tasks: Sequence[str], method: str, over: str, figure: str) -> str | None:
+    """Markdown table: one figure of a method over another, a line for each task, p over seeds after Holm's correction.
+
+    None where a task has no rows of both: the correction is for all of them.
+    """
+    found = {task: compare_by_seed(rows, task, method, over, figure) for task in tasks}
+    compared = {task: one for task, one in found.items() if one is not None}
+    if len(compared) < len(tasks):
+        return None
+    p = _adjusted({task: one.p_seeds for task, one in compared.items() if one.p_seeds is not None})
+    lines = head("task", f"{method} over {over}, {figure}", "of each seed", "p, seeds")
+    for task, one in compared.items():
+        ratio = "-" if one.ratio is None else f"{one.ratio:.3g}"
+        lines.append(line(task, ratio, _each(one), f"{p[task]:.2g}" if task in p else "-"))
+    return "\n".join(lines)
+
+
+def compare_by_seed(rows: Rows, task: str, method: str, over: str, figure: str) -> SeedComparison | None:
+    """Any figure of one method over another, over the seeds that both have; None where there is none."""
+    one, other = (
+        {
+            int(row["seed"]): float(row[figure])
+            for row in rows
+            if (row["task"], row.get("method")) == (task, name) and isinstance(row.get(figure), (int, float))
+        }
+        for name in (method, over)
+    )
+    seeds = tuple(sorted(one.keys() & other.keys()))
+    if not seeds:
+        return None
+    above, below = (tuple(values[seed] for seed in seeds) for values in (one, other))
+    ratios = tuple(a / b for a, b in zip(above, below, strict=True) if b)
+    return SeedComparison(
+        seeds=seeds,
+        values=above,
+        values_over=below,
+        ratio=sum(above) / sum(below) if sum(below) else None,
+        by_seed=ratios,
+        p_seeds=p_over_seeds(ratios) if len(ratios) == len(seeds) and min(ratios) > 0 else None,
+    )
 
 
 def compare(folder: Path, task: str, method: str, over: str, figure: str) -> MethodComparison | None:
@@ -154,7 +210,7 @@ def _adjusted(p: Mapping[str, float]) -> dict[str, float]:
     return found
 
 
-def _each(compared: MethodComparison) -> str:
+def _each(compared: MethodComparison | SeedComparison) -> str:
     return ", ".join(f"{ratio:.3g}" for ratio in compared.by_seed)
 
 

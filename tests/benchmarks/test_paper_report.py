@@ -11,7 +11,12 @@ import pytest
 
 from sprung.benchmarks import paper_report, rerun_paper
 from sprung.benchmarks.paper_report import compare, document, kept
-from sprung.benchmarks.paper_report.comparisons import comparisons, comparisons_by_seed, comparisons_of_pairs
+from sprung.benchmarks.paper_report.comparisons import (
+    comparisons,
+    comparisons_by_seed,
+    comparisons_of_pairs,
+    comparisons_of_tasks,
+)
 from sprung.benchmarks.paper_sources import sources
 from sprung.service.errors import UserError
 
@@ -172,6 +177,24 @@ def test_any_figure_of_the_rows_is_compared_by_seed(tmp_path: Path) -> None:
     assert row["values_over"] == [0.02, 0.04, 0.06]
     with pytest.raises(UserError, match="no rows of output_error and alps on pendulum from one seed with OE"):
         list(compare.run("pendulum", "output_error", figure="OE", data=tmp_path))
+
+
+def test_p_of_one_figure_is_corrected_for_the_number_of_tasks() -> None:
+    rows = [
+        {"task": task, "method": method, "seed": seed, "PE_noisy": value}
+        for seed in range(3)
+        for task, ratio in (("pendulum", 2 + 0.1 * seed), ("two_body", 1 + 0.5 * seed))
+        for method, value in (("alps", 0.1), ("output_error", 0.1 * ratio))
+    ]
+    one, other = (
+        comparisons_of_tasks(rows, tasks, "output_error", "alps", "PE_noisy")
+        for tasks in (["pendulum"], ["pendulum", "two_body"])
+    )
+    assert one is not None and other is not None
+    alone, beside = (lines(table)["pendulum"] for table in (one, other))
+    assert beside[:3] == ["pendulum", "2.1", "2, 2.1, 2.2"]
+    assert float(beside[3]) == pytest.approx(2 * float(alone[3]), rel=0.02)
+    assert comparisons_of_tasks(rows, ["pendulum", "train"], "output_error", "alps", "PE_noisy") is None
 
 
 def test_rows_that_are_kept_are_compared_as_those_that_were_made(tmp_path: Path) -> None:
