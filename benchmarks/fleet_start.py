@@ -36,6 +36,6 @@ def start(workers: int) -> Iterator[dict[str, Any]]:
 def _part(one: RunningProcess) -> str:
     if replica := REPLICA.match(one.command):
         return f"replica {replica[1]}"
-    if one.command.startswith("ray::Serve") or one.command.startswith("ray::Proxy"):
-        return "Ray Serve's controller and proxy"
+    if one.command.startswith("ray::Serve"):
+        return "Ray Serve's controller"
     return "the command" if "\0fleet\0serve\0" in one.command else "Ray's own processes"

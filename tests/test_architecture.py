@@ -126,7 +126,7 @@ LATE_OUTSIDE = {
     "service/monitoring/simulated.py": "torch, the same",
     "service/fleet/ray_replicas.py": "torch, in replicas: who starts them starts Ray's own processes first",
     "service/store/engine.py": "alembic, where somebody else has migrated the store",
-    "service/api/ray_serving.py": "FastAPI, in the door's replica alone",
+    "service/api/ray_door.py": "FastAPI, in the door's replica alone",
     "service/diagnosis/worker.py": "threads of linear algebra are bounded before it is loaded",
 }
 CORE_KNOWS = {"numpy", "scipy", "torch", "torchdiffeq", "pydantic", "pydantic_core", "yaml", "safetensors"}

@@ -12,27 +12,31 @@ import threading
 import time
 from typing import Any
 
+from sprung.service.api.ray_door import ListeningDoor, bound, door_app
 from sprung.service.errors import UserError
 from sprung.service.fleet.ray_head import RayHead
 from sprung.service.fleet.ray_replicas import ComputeReplica
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.processes.imports import lasting_imports
 from sprung.service.settings import Settings, settings_with
-from sprung.service.store import open_store
 
 log = logging.getLogger("sprung.ray")
-APPLICATION, COMPUTE = "sprung", "compute"
+APPLICATION, DOOR, COMPUTE = "sprung", "door", "compute"
 AT_ONCE = 2  # batches of one replica: what it identifies, and what it folds while the database keeps it waiting
 BUSY_BATCHES = 2.5  # of one replica, at work and waiting, beyond which another one is started
 HEALTH_SECONDS = 1.0  # a replica that died is missed after that
 PROBE_SECONDS = 0.5
 PROBE_TIMEOUT = 10.0  # s: a machine that is busy answers late
-SILENT_SECONDS = 10.0  # without an answer
+SILENT_SECONDS = 30.0  # without an answer: a door that died is back before, on a busy machine, too
 ABANDON_SECONDS = 10.0
+FINISH_SECONDS = 60.0  # for the requests that have come
 
 
-def application(settings: Settings, sizes: ServingSizes, migrated: bool = False) -> Any:
-    """The Serve application: `serve.run(application(...))`; migrated: the store has been."""
+def application(settings: Settings, sizes: ServingSizes, migrated: bool = False, listening: bool = False) -> Any:
+    """The Serve application: `serve.run(application(...))`; migrated: the store has been.
+
+    listening: the door takes connections at the settings' address itself, instead of Serve's proxies.
+    """
     from ray import serve
 
     least = min(sizes.least, sizes.replicas)
@@ -46,6 +50,7 @@ def application(settings: Settings, sizes: ServingSizes, migrated: bool = False)
     watched: dict[str, Any] = {
         "health_check_period_s": HEALTH_SECONDS,
         "graceful_shutdown_timeout_s": settings.shutdown_seconds,
+        "logging_config": {"enable_access_log": False},  # the door has its own
     }
     deployment: Any = serve.deployment
     compute = deployment(
@@ -55,37 +60,25 @@ def application(settings: Settings, sizes: ServingSizes, migrated: bool = False)
         autoscaling_config=scaling,
         max_ongoing_requests=AT_ONCE,
         **watched,
-    )
+    ).bind(settings, migrated)
+    door = {"name": DOOR, "num_replicas": 1, "ray_actor_options": {"num_cpus": sizes.cores / 4}} | watched
+    if listening:
+        return deployment(ListeningDoor, **door).bind(settings, sizes, migrated, compute)
 
     def build() -> Any:
-        """The door's ASGI application; runs in its replica, and what it needs is imported there alone."""
-        with lasting_imports():
-            from sprung.service.api.live_ingest import ingest_app
-            from sprung.service.fleet.ray_behind import RayBehind
-
-        behind = RayBehind(serve.get_deployment_handle(COMPUTE, APPLICATION), sizes, serve.batch)
-        return ingest_app(settings, open_store(settings.store_url, migrated), behind)
+        return door_app(settings, sizes, migrated, serve.get_deployment_handle(COMPUTE, APPLICATION))
 
     class Door:
-        """Authenticates requests, reads their bodies, passes them on."""
+        """Requests come from Serve's proxies."""
 
         def __init__(self, *after: Any) -> None:
             """after: deployments that are started before it."""
 
-    door = deployment(
-        serve.ingress(build)(Door),
-        name="door",
-        num_replicas=1,
-        ray_actor_options={"num_cpus": sizes.cores / 4},
-        max_ongoing_requests=8 * sizes.queued,
-        **watched,
-    )
-    return door.bind(compute.bind(settings, migrated))
+    behind_proxies = deployment(serve.ingress(build)(Door), max_ongoing_requests=8 * sizes.queued, **door)
+    return behind_proxies.bind(compute)
 
 
-def start(
-    settings: Settings, sizes: ServingSizes, host: str, port: int, address: str | None, cores: int | None
-) -> RayHead | None:
+def start(settings: Settings, sizes: ServingSizes, address: str | None, cores: int | None) -> RayHead | None:
     """Serve on the cluster at `address`, or on a Ray that is started here; returns when requests are taken.
 
     The store must have been migrated.  The head of a Ray that was started here.
@@ -96,13 +89,18 @@ def start(
             from ray import serve
     except ModuleNotFoundError as error:
         raise UserError("Ray is not installed: pip install 'sprung[fleet]'") from error
-    head = None
     if address:
         ray.init(address=address)
-    else:
-        head = RayHead(cores)
-    serve.start(http_options={"host": host, "port": port})
-    serve.run(application(settings, sizes, migrated=True), name=APPLICATION, route_prefix="/")
+        serve.start(http_options={"host": settings.host, "port": settings.port})
+        serve.run(application(settings, sizes, migrated=True), name=APPLICATION, route_prefix="/")
+        return None
+    try:
+        bound(settings.host, settings.port).close()
+    except OSError as error:
+        raise UserError(f"{settings.host}:{settings.port}: {error.strerror}") from error
+    head = RayHead(cores)
+    serve.start(proxy_location="Disabled")
+    serve.run(application(settings, sizes, migrated=True, listening=True), name=APPLICATION, route_prefix=None)
     return head
 
 
@@ -114,6 +112,8 @@ def stop(head: RayHead | None) -> None:
     import ray
     from ray import serve
 
+    if head is not None:
+        serve.get_deployment_handle(DOOR, APPLICATION).finish.remote().result(timeout_s=FINISH_SECONDS)
     serve.delete(APPLICATION)
     ray.shutdown()
     if head is not None:
@@ -131,7 +131,7 @@ def abandon(head: RayHead | None) -> None:
         head.close()
 
 
-def watch(stopping: threading.Event, host: str, port: int, head: RayHead | None) -> bool:
+def watch(stopping: threading.Event, settings: Settings, head: RayHead | None) -> bool:
     """Wait until `stopping` is set: true; or until nobody takes requests any more: false.  Whoever started the process
     then starts it anew.
 
@@ -143,16 +143,20 @@ def watch(stopping: threading.Event, host: str, port: int, head: RayHead | None)
             log.warning("Ray's head has died; starting it anew")
             if not head.start_anew():
                 return False
-        if _answers(host, port):
+        if _answers(settings):
             answered = time.monotonic()
         elif time.monotonic() - answered > SILENT_SECONDS:
             return False
     return True
 
 
-def _answers(host: str, port: int) -> bool:
-    connection = http.client.HTTPConnection("127.0.0.1" if host == "0.0.0.0" else host, port, timeout=PROBE_TIMEOUT)
+def _answers(settings: Settings) -> bool:
+    address = "127.0.0.1" if settings.host == "0.0.0.0" else settings.host, settings.port
+    connection = http.client.HTTPConnection(*address, timeout=PROBE_TIMEOUT)
     try:
+        connection.connect()
+        if settings.tls_certificate is not None:  # which may want a certificate of its clients
+            return True
         connection.request("GET", "/health/live")
         return connection.getresponse().status < 500
     except (OSError, http.client.HTTPException):

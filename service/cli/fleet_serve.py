@@ -22,14 +22,14 @@ def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None,
     settings = settings_with(options)
     with closing(open_store(settings.store_url)) as store:  # migrated once, before replicas start
         notice = access_notice(settings, Tokens(store).any)
-    head = ray_serving.start(settings, sizes, settings.host, settings.port, address, workers)
+    head = ray_serving.start(settings, sizes, address, workers)
     if notice:
         announce_access(notice)
     print(f"Sprung takes windows and estimates on http://{settings.host}:{settings.port}; Ctrl-C stops", flush=True)
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
-    if ray_serving.watch(stopping, settings.host, settings.port, head):
+    if ray_serving.watch(stopping, settings, head):
         ray_serving.stop(head)
         return 0
     print("sprung: Ray Serve does not answer any more; start this command again", file=sys.stderr, flush=True)

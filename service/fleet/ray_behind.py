@@ -8,14 +8,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
-
-from sprung.model.signals import Estimate, FloatArray, MeasurementFault
+from sprung.model.signals import MeasurementFault
 from sprung.service.errors import Busy, UserError
-from sprung.service.fleet.message import IngestResult, Message, SentWindows, WindowEstimate, read_messages
+from sprung.service.fleet.message import IngestResult, Message, SentWindows, read_messages
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.monitoring.form import WindowForm
 
+_Asked = tuple[SentWindows, tuple[MeasurementFault, ...]]  # windows, and what is wrong with their vehicle's sensors
 MOST_FAULTY = 10_000  # vehicles whose faults are held; one that is heard from again is told anew with its first window
 
 
@@ -31,7 +30,7 @@ class RayBehind:
         self._waiting, self._most = 0, sizes.queued * sizes.replicas
         # one more than there are replicas, so that none waits for the next; more, and batches stay small
         wait = {"batch_wait_timeout_s": sizes.batch_wait_seconds, "max_concurrent_batches": sizes.replicas + 1}
-        self._identified = batch(max_batch_size=sizes.batch_windows, **wait)(self._identify_together)
+        self._taken = batch(max_batch_size=sizes.batch_windows, batch_size_fn=_windows_of, **wait)(self._take_together)
         self._folded = batch(max_batch_size=sizes.batch_messages, **wait)(self._fold_together)
 
     async def form(self) -> WindowForm:
@@ -43,17 +42,13 @@ class RayBehind:
     async def fold(self, body: bytes) -> IngestResult:
         """Fold a message."""
         with self._place():
-            return await self._fold_one((await asyncio.to_thread(read_messages, [body]))[0])
+            return self._learned(await self._folded((await asyncio.to_thread(read_messages, [body]))[0]))
 
     async def identify_and_fold(self, sent: SentWindows) -> IngestResult:
         """Identify windows, together with those of others, and fold them together."""
         with self._place():
-            known = self._faults.get(sent.vehicle, ())
-            ways = [self._identified((*one, known)) for one in zip(sent.starts, sent.values, strict=True)]
-            estimates: list[Estimate] = await asyncio.gather(*ways)
-            found = zip(sent.starts, estimates, strict=True)
-            windows = tuple(WindowEstimate(start, "used", None, 0, False, estimate) for start, estimate in found)
-            return await self._fold_one(Message(sent.vehicle, (await self.form()).digest, windows))
+            taken: IngestResult | UserError = await self._taken((sent, self._faults.get(sent.vehicle, ())))
+            return self._learned(taken)
 
     @contextmanager
     def _place(self) -> Iterator[None]:
@@ -66,8 +61,7 @@ class RayBehind:
         finally:
             self._waiting -= 1
 
-    async def _fold_one(self, message: Message) -> IngestResult:
-        taken: IngestResult | UserError = await self._folded(message)
+    def _learned(self, taken: IngestResult | UserError) -> IngestResult:
         if isinstance(taken, UserError):
             raise taken
         self._learn(taken)
@@ -81,16 +75,18 @@ class RayBehind:
             if len(self._faults) > MOST_FAULTY:
                 self._faults.popitem(last=False)
 
-    async def _identify_together(
-        self, asked: list[tuple[int, FloatArray, tuple[MeasurementFault, ...]]]
-    ) -> list[Estimate]:
-        starts, values, known = zip(*asked, strict=True)
-        found: list[Estimate] = await _asked(self._compute.identify.remote(list(starts), np.stack(values), list(known)))
+    async def _take_together(self, asked: list[_Asked]) -> list[IngestResult | UserError]:
+        sent, known = zip(*asked, strict=True)
+        found: list[IngestResult | UserError] = await _asked(self._compute.take.remote(list(sent), list(known)))
         return found
 
     async def _fold_together(self, messages: list[Message]) -> list[IngestResult | UserError]:
         found: list[IngestResult | UserError] = await _asked(self._compute.fold.remote(messages))
         return found
+
+
+def _windows_of(asked: list[_Asked]) -> int:
+    return sum(len(sent.starts) for sent, _ in asked)
 
 
 async def _asked(pending: Any) -> Any:

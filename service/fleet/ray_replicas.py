@@ -9,9 +9,11 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 
-from sprung.model.signals import Estimate, FloatArray, MeasurementFault
+import numpy as np
+
+from sprung.model.signals import MeasurementFault
 from sprung.service.errors import UserError
-from sprung.service.fleet.message import IngestResult, Message
+from sprung.service.fleet.message import IngestResult, Message, SentWindows, WindowEstimate
 from sprung.service.monitoring.form import WindowForm
 from sprung.service.processes.imports import lasting_imports
 from sprung.service.processes.threads import one_thread_each
@@ -46,13 +48,28 @@ class ComputeReplica:
         """What windows have to look like."""
         return self._engine.form
 
-    async def identify(
-        self, starts: list[int], values: FloatArray, known: list[tuple[MeasurementFault, ...]]
-    ) -> list[Estimate]:
-        """The estimates of windows, values (B, T, C); known: faults of each one's vehicle, as `Engine.identify` has
-        them."""
+    async def take(
+        self, sent: Sequence[SentWindows], known: Sequence[tuple[MeasurementFault, ...]]
+    ) -> list[IngestResult | UserError]:
+        """Identify windows of some vehicles together, then fold them as `fold` does: what became of each one's.
+
+        known: faults of each one's vehicle, as `Engine.identify` has them.
+        """
+        starts = [start for one in sent for start in one.starts]
+        values = np.concatenate([one.values for one in sent])
+        faults = [of for one, of in zip(sent, known, strict=True) for _ in one.starts]
         async with self._identifying:
-            return (await asyncio.to_thread(self._engine.identify, values, starts=starts, known=known))[0]
+            found = (await asyncio.to_thread(self._engine.identify, values, starts=starts, known=faults))[0]
+        estimates = iter(found)
+        messages = [
+            Message(
+                one.vehicle,
+                self._engine.digest,
+                tuple(WindowEstimate(start, "used", None, 0, False, next(estimates)) for start in one.starts),
+            )
+            for one in sent
+        ]
+        return await self.fold(messages)
 
     async def fold(self, messages: Sequence[Message]) -> list[IngestResult | UserError]:
         """What became of each message; they are stored, but for those with an error."""

@@ -19,7 +19,7 @@ from sprung.model.system import System
 from sprung.service.core import build_core
 from sprung.service.errors import Busy, UserError
 from sprung.service.fleet import ray_behind
-from sprung.service.fleet.message import IngestResult, Message, SentWindows
+from sprung.service.fleet.message import IngestResult, SentWindows
 from sprung.service.fleet.ray_behind import RayBehind
 from sprung.service.fleet.ray_replicas import ComputeReplica
 from sprung.service.fleet.serving_sizes import ServingSizes
@@ -89,25 +89,20 @@ def window(vehicle: str, start: int, count: int = 1) -> SentWindows:
     return SentWindows(vehicle, [start + i for i in range(count)], np.zeros((count, 2, 3)))
 
 
-def taken(message: Message) -> IngestResult | UserError:
-    return (
-        UserError("not this one")
-        if message.vehicle == "v-3"
-        else IngestResult(message.vehicle, len(message.windows), 0, 0)
-    )
+def taken(sent: SentWindows) -> IngestResult | UserError:
+    return UserError("not this one") if sent.vehicle == "v-3" else IngestResult(sent.vehicle, len(sent.starts), 0, 0)
 
 
 @dataclass(frozen=True)
 class Handle:
     """A deployment's handle, here."""
 
-    identify: Remote
-    fold: Remote
+    take: Remote
     form: AskedForm
 
 
 def behind(**sizes: Any) -> tuple[RayBehind, Handle]:
-    handle = Handle(Remote(lambda start: None), Remote(taken), AskedForm())
+    handle = Handle(Remote(taken), AskedForm())
     return RayBehind(handle, ServingSizes(**sizes), batch), handle
 
 
@@ -116,8 +111,7 @@ def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
         ray, handle = behind(replicas=1, batch_windows=8, batch_wait_seconds=0.05)
         calls = [ray.identify_and_fold(window(f"v-{i}", i)) for i in range(8)]
         found = await asyncio.gather(*calls, return_exceptions=True)
-        assert handle.identify.sizes == [8]
-        assert sum(handle.fold.sizes) == 8 and len(handle.fold.sizes) <= 2
+        assert handle.take.sizes == [8]
         return found
 
     found = asyncio.run(asked())
@@ -153,7 +147,7 @@ def test_windows_of_one_request_are_identified_and_folded_together() -> None:
             ray.identify_and_fold(window("v-1", 0, 10)), ray.identify_and_fold(window("v-2", 0, 5))
         )
         assert [one.folded for one in found] == [10, 5]
-        assert handle.identify.sizes == [15] and sum(handle.fold.sizes) == 2
+        assert handle.take.sizes == [2]
 
     asyncio.run(asked())
 
@@ -168,7 +162,7 @@ class Called:
 async def followed_on_ray(settings: Settings, sent: list[SentWindows]) -> dict[str, object]:
     """A vehicle's tracker after windows that were sent one after the other, by a replica itself."""
     replica = ComputeReplica(settings)
-    methods = {name: Called(getattr(replica, name)) for name in ("form", "identify", "fold")}
+    methods = {name: Called(getattr(replica, name)) for name in ("form", "take")}
     with closing(replica._ingest):
         ray = RayBehind(SimpleNamespace(**methods), ServingSizes(replicas=1), batch)
         for one in sent:
@@ -215,15 +209,12 @@ def test_faults_that_are_over_and_those_of_too_many_vehicles_are_forgotten(monke
     told: list[tuple[MeasurementFault, ...]] = []
     wrong = {f"v-{number}" for number in range(5)}
 
-    async def identify(starts: list[int], values: Any, known: list[tuple[MeasurementFault, ...]]) -> list[None]:
+    async def take(sent: list[SentWindows], known: list[tuple[MeasurementFault, ...]]) -> list[IngestResult]:
         told.extend(known)
-        return [None] * len(starts)
-
-    async def fold(messages: list[Message]) -> list[IngestResult]:
-        return [IngestResult(m.vehicle, 1, 0, 0, fault if m.vehicle in wrong else ()) for m in messages]
+        return [IngestResult(one.vehicle, 1, 0, 0, fault if one.vehicle in wrong else ()) for one in sent]
 
     async def asked() -> None:
-        handle = SimpleNamespace(identify=Called(identify), form=AskedForm(), fold=Called(fold))
+        handle = SimpleNamespace(take=Called(take), form=AskedForm())
         ray = RayBehind(handle, ServingSizes(replicas=1), batch)
         send = partial(_sent_one_by_one, ray)
         await send(["v-1", "v-1"])

@@ -14,6 +14,7 @@ import pytest
 from sprung.model.system import load_system
 from sprung.service.api import ray_serving
 from sprung.service.api.ray_serving import APPLICATION, COMPUTE
+from sprung.service.fleet.message import SentWindows
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
@@ -21,6 +22,7 @@ from tests.ray_apart import in_own_process
 
 pytest.importorskip("ray.serve")
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # Ray's own
+FIRST = 1_790_000_000_000_000_000  # ns
 SIZES = ServingSizes(replicas=2, cores=0.5, more_after_seconds=1.0, fewer_after_seconds=3.0)
 
 
@@ -52,23 +54,31 @@ def come_and_go(folder: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
-    settings = Settings(data_dir=folder, store=f"sqlite:///{folder}/sprung.db")
+    settings = Settings(data_dir=folder, store=f"sqlite:///{folder}/sprung.db", port=port)
     open_store(settings.store_url).close()
-    head = ray_serving.start(settings, SIZES, "127.0.0.1", port, None, 2)
+    head = ray_serving.start(settings, SIZES, None, 2)
     handle: Any = serve.get_deployment_handle(COMPUTE, APPLICATION)
     try:
-        identify = handle.identify
         assert running() == 1
-        windows = np.random.default_rng(1).normal(size=(32, system.window, len(system.channels)))
-        nothing: list[Any] = [()] * 32
-        waiting = [identify.remote(list(range(32)), 0.01 * windows, nothing) for _ in range(4)]
+        windows = 0.01 * np.random.default_rng(1).normal(size=(32, system.window, len(system.channels)))
+        sent, nothing = [SentWindows("v-1", [FIRST + i * 10**9 for i in range(32)], windows)], [()]
+
+        def ask() -> (
+            Any
+        ):  # the same windows again and again: they are identified, and known or waiting when they are folded
+            return handle.take.remote(sent, nothing)
+
+        def done(waiting: Any) -> bool:
+            [taken] = waiting.result(timeout_s=120)
+            return bool(taken.folded + taken.waiting + taken.known == 32)
+
+        waiting = [ask() for _ in range(4)]
         count = len(waiting)
         while running() < 2 and count < 400:
-            waiting = [one for one in waiting if len(one.result(timeout_s=120)) != 32]  # they come to nothing else
-            waiting += [identify.remote(list(range(32)), 0.01 * windows, nothing) for _ in range(8)]
+            assert all(map(done, waiting))
+            waiting = [ask() for _ in range(8)]
             count += 8
-        for one in waiting:
-            assert len(one.result(timeout_s=120)) == 32
+        assert all(map(done, waiting))
         assert running() == 2
         assert becomes(lambda: running() == 1, 60.0)
     finally:
