@@ -58,6 +58,19 @@ def test_a_figure_of_one_seed_must_come_out_again(
     assert (asked, row["within"]) == ([("kernels", 4)], within)
 
 
+def test_a_table_without_methods_is_drawn_from_by_its_inputs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(paper, "run", lambda *_, **__: [{"inputs": n, "balance": 0.01 * n} for n in (1, 2)])
+    text = "| method | balance |\n|---|---|\n| 2 inputs | 0.02 |\n\nMade at `abc`, seed 0."
+    (tmp_path / "page.md").write_text(f"<!-- rows phase -->\n{text}\n<!-- end -->")
+    (row,) = rerun_paper.run(1, task="phase", document=tmp_path / "page.md")
+    assert (row["method"], row["again"], row["within"]) == ("2 inputs", 0.02, True)
+
+
+def test_every_table_of_rows_on_the_page_is_drawn_from() -> None:
+    text = rerun_paper.DOCUMENT.read_text()
+    assert {task for task, _ in rerun_paper.BLOCK.findall(text)} == {cell.task for cell in rerun_paper.stated(text)}
+
+
 def test_a_figure_of_several_seeds_may_vary_as_they_do() -> None:
     cell = next(c for c in rerun_paper.stated(PAGE) if (c.method, c.column) == ("zero", "SE"))
     assert 36 < cell.allowed < 45
