@@ -17,6 +17,8 @@ from sprung.service.fleet.tasks import start_ray
 log = logging.getLogger("sprung.ray")
 PROBE_TIMEOUT = 2.0  # s: the head is on this machine
 START_SECONDS, POLL_SECONDS = 30.0, 0.05
+# what every replica imports; a process that is started ahead of need imports it while it waits
+PRELOADED = ["ray.serve._private.replica", "sprung.service.fleet.ray_replicas"]
 
 
 class RayHead:
@@ -27,7 +29,8 @@ class RayHead:
         import ray
 
         self._kept = tempfile.TemporaryDirectory(prefix="sprung-ray-", ignore_cleanup_errors=True)
-        start_ray(cores, {"gcs_storage": "rocksdb", "gcs_storage_path": self._kept.name})
+        kept = {"gcs_storage": "rocksdb", "gcs_storage_path": self._kept.name}
+        start_ray(cores, kept | {"preload_python_modules": PRELOADED})
         host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
         self._address = host, int(port)
 
