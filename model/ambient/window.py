@@ -21,6 +21,8 @@ from sprung.model.system import System
 SHARPEST, BLUNTEST = 0.002, 0.03  # width of a group of bins over its frequency
 BLURS = (0.1, 0.01, 0.001)  # see `Whittle`; steps on the way to none
 RIGID = 1e-6  # of the highest natural frequency: slower modes are motions of the whole without any spring
+CERTAIN = 20.0  # degrees of freedom of a mean of power that tells whether it stands out of the noise
+SLOPE = 2  # groups of bins in which the spectrum falls where the excitation ends, and into which it leaks
 LOAD_STD = 0.3  # of a body's mass that varies, where the file states no range
 
 
@@ -92,12 +94,12 @@ class WindowFit:
         found = spectra(values, rate, (low, rules.highest * rate), self.sharpness)
         power = np.diagonal(found.matrix, axis1=1, axis2=2).real / noise**2
         about = np.maximum(found.weight, 1e-9)
-        width = np.ones(max(1, min(9, len(about) // 4)))
+        width = np.ones(int(np.clip(np.ceil(CERTAIN / np.median(about)), 3, max(3, min(9, len(about) // 4)))))
         smooth = np.stack([np.convolve(p * about, width, "same") for p in power.T], axis=1)
         smooth /= np.convolve(about, width, "same")[:, None]
         silent = np.flatnonzero(smooth.max(axis=1) < rules.excess)
-        top = found.frequency[silent[0]] * 0.97 if len(silent) else np.inf
-        keep = found.frequency < top
+        # The band ends where the excitation does: before what the mean, the slope and its leakage reach.
+        keep = np.arange(len(about)) < (silent[0] - len(width) // 2 - SLOPE if len(silent) else len(about))
         if keep.sum() < rules.groups or found.frequency[keep][-1] < low * 2**rules.octaves:
             return None
         return found.part(np.flatnonzero(keep))

@@ -11,6 +11,7 @@ import scipy.linalg
 import scipy.signal
 
 import sprung
+from sprung.benchmarks.generator import track
 from sprung.benchmarks.generator.ride import DrawnRide, draw_ride, record
 from sprung.model.ambient.forces import ForceExcitation
 from sprung.model.ambient.identify import AmbientIdentifier
@@ -191,6 +192,19 @@ def test_estimates_say_what_they_do_not_know(vehicle: System) -> None:
     assert np.isnan(seen.per_sensor[4:8]).all()
     assert (seen.log_ratio[~seen.identifiable] == 0).all()
     assert np.allclose(np.diag(seen.covariance)[~seen.identifiable], 1.0)
+
+
+@pytest.mark.parametrize("speed", [26.0, 29.3, 34.1, 41.7])
+def test_the_band_ends_where_the_track_does(vehicle: System, speed: float) -> None:
+    """A group beyond the shortest wavelength would pull levels, and with them springs and load, the same way always."""
+    rng = np.random.default_rng(3)
+    ride = replace(draw_ride(rng), speed=speed)
+    identifier = AmbientIdentifier(vehicle)
+    found = identifier.window.spectra(record(rng, ride, 60.0), vehicle.sensor_noise)
+    assert found is not None
+    end = track.SHORTEST * speed / (2 * np.pi)
+    top = found.frequency[-1] + found.reach[-1]
+    assert end - 1.0 < top < end
 
 
 def test_standstill_is_uninformative_and_raises_nothing(vehicle: System) -> None:
