@@ -120,7 +120,7 @@ class ChaosFleet:
 class ChaosOutcome:
     """What happened."""
 
-    recoveries: list[tuple[str, float]] = field(default_factory=list)
+    recoveries: list[tuple[str, float, float]] = field(default_factory=list)  # what, after how many s, load then
     published: int = 0
 
 
@@ -166,7 +166,7 @@ def chaos(minutes: float, every: float) -> Figures:
 
 
 def _recoveries(outcome: ChaosOutcome) -> Figures:
-    worst = max((seconds for _, seconds in outcome.recoveries), default=0.0)
+    worst = max((seconds for _, seconds, _ in outcome.recoveries), default=0.0)
     yield {
         "figure": "longest recovery after a restart",
         "value": round(worst, 1),
@@ -174,7 +174,8 @@ def _recoveries(outcome: ChaosOutcome) -> Figures:
         "target": RECOVERY_TARGET,
         "load": os.getloadavg()[0],
     }
-    yield {"figure": "recoveries", "value": [[name, round(seconds, 1)] for name, seconds in outcome.recoveries]}
+    each = [[name, round(seconds, 1), round(load, 1)] for name, seconds, load in outcome.recoveries]
+    yield {"figure": "recoveries, with the load of the machine then", "value": each}
 
 
 def _ride(
@@ -249,7 +250,7 @@ def _disturb(parts: list[KilledPart], store: Store, seconds: float, every: float
                 break
             before = now if before < 0 else before
             time.sleep(0.1)
-        outcome.recoveries.append((part.name, time.monotonic() - restarted))
+        outcome.recoveries.append((part.name, time.monotonic() - restarted, os.getloadavg()[0]))
 
 
 def _undisturbed(engine: Any, messages: list[Message], folder: Path) -> Store:
