@@ -1,8 +1,9 @@
 """`sensors`: one wrong measurement on a healthy vehicle. It must be named, and no spring accused.
 
 Rides of two minutes of `benchmarks/generator`; one channel reads too much, late, reversed, not at all, or another's,
-from the first window or from the middle of the ride on.  Counted are alarms on springs and dampers, whether what is
-wrong is named (channel and kind), and values that are off by more than three stated deviations without anything said.
+sends nothing or zeros, or a whole node sends nothing, from the first window or from the middle of the ride on.  Counted
+are alarms on springs and dampers, whether what is wrong is named (channel and kind), values that are off by more than
+three stated deviations without anything said, and rides at whose end what is left is monitored.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.vehicle import read_vehicle
 from sprung.benchmarks.keeping import keep, kept
 from sprung.model.identification.identify import Identifier
+from sprung.model.signals import Channel
 from sprung.model.system import BUNDLED, System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from sprung.service.monitoring.engine import WEIGHED_OF, make_tracker
@@ -35,7 +37,12 @@ SIZES: dict[str, tuple[float, ...]] = {
     "frozen": (0.0,),
     "inverted": (0.0,),
     "swapped": (0.0,),
+    "silent": (0.0,),
+    "zero": (0.0,),
+    "silent node": (0.0,),
+    "silent wheels": (0.0,),
 }
+CALLED = {"zero": "frozen", "silent node": "silent", "silent wheels": "silent"}  # where the kind's name is another
 NAMED_FROM = {"gain": 0.02, "delay": 1e-3}  # what the target asks to be named
 SILENT = 3.0  # stated deviations
 START = 1_800_000_000_000_000_000  # ns
@@ -48,7 +55,7 @@ class WrongChannel:
     kind: str
     size: float
     channel: int
-    other: int  # with which it is exchanged
+    others: tuple[int, ...]  # with which it is exchanged, or which are silent with it
     begins: float  # s
 
 
@@ -60,6 +67,7 @@ class RideVerdict:
     named: bool  # channel and kind, at the end or in an alarm
     said: bool  # that something is wrong with a measurement
     silent: int  # values off by more than three deviations, where nothing is said
+    monitored: bool  # at the end
 
 
 def run(
@@ -103,6 +111,7 @@ def _figures(file: str, name: str, size: float, when: str, found: list[RideVerdi
         "named": sum(j.named for j in found),
         "said": sum(j.said for j in found),
         "silent_errors": sum(j.silent for j in found),
+        "monitored": sum(j.monitored for j in found),
         "target": "no spring alarm, no silent error" + (", named in 95 %" if asked else ""),
     }
 
@@ -113,14 +122,30 @@ def _drawn(system: System, kind: str, size: float, begins: float, rng: np.random
     sign = rng.choice([-1.0, 1.0])
     while True:
         channel = int(rng.integers(len(channels)))
-        node = (channels[channel].mcap or "").rpartition(".")[0]
+        node = _node(channels[channel])
         alike = [
             i for i, c in enumerate(channels)
-            if i != channel and (c.mcap or "").rpartition(".")[0] == node and c.unit == channels[channel].unit
+            if i != channel and _node(c) == node and c.unit == channels[channel].unit
         ]  # fmt: skip
-        if alike or kind != "swapped":
-            other = int(rng.choice(alike)) if alike else channel
-            return WrongChannel(kind, sign * size, channel, other, begins)
+        if kind == "swapped" and not alike:
+            continue
+        others: tuple[int, ...] = (int(rng.choice(alike)),) if alike else ()
+        if kind != "swapped":
+            others = ()
+        if kind == "silent node":
+            others = tuple(i for i, c in enumerate(channels) if i != channel and _node(c) == node)
+        elif kind == "silent wheels":  # all but that of the drawn channel
+            left = channels[channel].name.partition(".")[0]
+            others = tuple(i for i, c in enumerate(system.inputs) if c.name.partition(".")[0] != left)
+            if len(others) == len(system.inputs):
+                continue
+            channel, others = others[0], others[1:]
+        return WrongChannel(kind, sign * size, channel, others, begins)
+
+
+def _node(channel: Channel) -> str:
+    """What sends a channel."""
+    return (channel.mcap or "").rpartition(".")[0]
 
 
 def ride(
@@ -159,14 +184,17 @@ def ride(
         elif fault.kind == "inverted":
             wrong = -wrong
         elif fault.kind == "swapped":
-            wrong = clean[:, fault.other].copy()
-            clean[first:, fault.other] = clean[first:, fault.channel]
+            wrong = clean[:, fault.others[0]].copy()
+            clean[first:, fault.others[0]] = clean[first:, fault.channel]
         clean[first:, fault.channel] = wrong[first:]
     noise = np.array([channel.noise for channel in system.channels])
     values = clean + noise * rng.standard_normal(clean.shape)
-    if fault is not None and fault.kind == "frozen":
+    if fault is not None:
         first = round(fault.begins * SAMPLE_RATE)
-        values[first:, fault.channel] = values[first, fault.channel]
+        if fault.kind in ("frozen", "zero"):
+            values[first:, fault.channel] = values[first, fault.channel] if fault.kind == "frozen" else 0.0
+        elif fault.kind.startswith("silent"):
+            values[first:, [fault.channel, *fault.others]] = np.nan
     return values, np.log(ratio)
 
 
@@ -192,16 +220,20 @@ def judge(
         named=named,
         said=said,
         silent=0 if said else off,
+        monitored=state.coverage.monitored,
     )
 
 
 def _is_named(system: System, tracker: Tracker, state: TrackerState, fault: WrongChannel) -> bool:
-    """Whether the channel and the kind are reported, as a state or as an alarm, whatever else is."""
+    """Whether all channels and the kind are reported, as a state or as an alarm, whatever else is."""
     names = [channel.name for channel in system.channels]
     reported: set[tuple[str, str]] = {(f.channel, f.kind) for f in tracker.sensors(state)}
     for alarm in state.alarms:
         if alarm.kind == "sensor":
             channel, _, kind = (alarm.parameter or "").rpartition(".")
             reported.add((channel, kind))
-    places = {names[fault.channel], names[fault.other]} if fault.kind == "swapped" else {names[fault.channel]}
-    return any(kind == fault.kind and places == set(channel.split("|")) for channel, kind in reported)
+    kind = CALLED.get(fault.kind, fault.kind)
+    every = {names[c] for c in (fault.channel, *fault.others)}
+    if kind == "silent":
+        return every <= {channel for channel, of in reported if of == kind}
+    return any(of == kind and every == set(channel.split("|")) for channel, of in reported)

@@ -231,7 +231,7 @@ class _Inputs:
 def _inputs(system: System, values: FloatArray, dt: float, frozen: set[str], notes: list[str]) -> _Inputs:
     """Inputs from the columns (T, C) of a recording.  Errors: `DiagnosisError` when one is missing."""
     found = _Inputs([], [], [], [], [], [], [], [], None)
-    column = 0
+    column, missing = 0, list[str]()
     for name, source in system.file.inputs.items():
         if isinstance(source, TrackInput):  # not measured
             continue
@@ -239,7 +239,8 @@ def _inputs(system: System, values: FloatArray, dt: float, frozen: set[str], not
         there = {q: values[:, column + i] for i, q in enumerate(quantities) if not np.isnan(values[0, column + i])}
         column += len(quantities)
         if not there:
-            raise DiagnosisError(_missing(name, frozen))
+            missing.append(name)
+            continue
         if not isinstance(source, SupportInput):
             found.force.append(there[""])
             found.force_names.append(name)
@@ -256,6 +257,8 @@ def _inputs(system: System, values: FloatArray, dt: float, frozen: set[str], not
         found.integrated.append("displacement" not in there)
         found.accelerated.append("acceleration" in there)
         found.support_names.append(name)
+    if missing:
+        raise DiagnosisError(_missing(system, missing, frozen))
     return found
 
 
@@ -350,6 +353,13 @@ def _second_derivative(displacement: FloatArray, acceleration: FloatArray, dt: f
     return acceleration - lost
 
 
-def _missing(name: str, frozen: set[str]) -> str:
-    state = "is stuck" if any(f.startswith(name) for f in frozen) else "is missing from the recording"
-    return f"input {name} {state}: nothing can be simulated without it; record it again or repair the channel"
+def _missing(system: System, names: list[str], frozen: set[str]) -> str:
+    """Why a recording that lacks some inputs cannot be diagnosed, and what to do, in one line."""
+    several = len(names) > 1
+    which = f"input{'s' * several} {' and '.join(names) if len(names) < 3 else f'{names[0]} and {len(names) - 1} more'}"
+    stuck = all(any(f.startswith(name) for f in frozen) for name in names)
+    state = f"{'are' if several else 'is'} {'stuck' if stuck else 'missing from the recording'}"
+    them = "them" if several else "it"
+    supports = all(isinstance(system.file.inputs[name], SupportInput) for name in names)
+    other = "; a vehicle below which nothing is measured needs inputs of kind track" if supports and not stuck else ""
+    return f"{which} {state}: nothing can be simulated without {them}; record {them} again or repair the channel{other}"
