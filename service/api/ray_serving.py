@@ -90,6 +90,8 @@ def start(settings: Settings, sizes: ServingSizes, address: str | None, cores: i
     except ModuleNotFoundError as error:
         raise UserError("Ray is not installed: pip install 'sprung[fleet]'") from error
     if address:
+        if settings.tls_certificate is not None:
+            raise UserError("on a cluster Ray Serve's proxies take connections, without TLS: leave the certificate out")
         ray.init(address=address)
         serve.start(http_options={"host": settings.host, "port": settings.port})
         serve.run(application(settings, sizes, migrated=True), name=APPLICATION, route_prefix="/")

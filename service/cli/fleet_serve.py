@@ -25,7 +25,9 @@ def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None,
     head = ray_serving.start(settings, sizes, address, workers)
     if notice:
         announce_access(notice)
-    print(f"Sprung takes windows and estimates on http://{settings.host}:{settings.port}; Ctrl-C stops", flush=True)
+    scheme = "http" if settings.tls_certificate is None else "https"
+    place = f"{scheme}://{settings.host}:{settings.port}"
+    print(f"Sprung takes windows and estimates on {place}; Ctrl-C stops", flush=True)
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())

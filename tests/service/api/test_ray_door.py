@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 from fastapi import FastAPI
 
-from sprung.service.api import ray_door
+from sprung.service.api import ray_door, ray_serving
 from sprung.service.api.ray_door import ListeningDoor
+from sprung.service.errors import UserError
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import Settings
 
@@ -79,3 +80,19 @@ def test_an_address_that_another_one_has_is_an_error(tmp_path: Path, monkeypatch
                 await opened(Settings(data_dir=tmp_path, port=other.getsockname()[1]))
 
     asyncio.run(asked())
+
+
+@pytest.mark.filterwarnings("ignore")  # Ray's own, when it is imported
+def test_what_cannot_be_served_is_said_before_ray_starts(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(UserError, match=f"127.0.0.1:{port}: "):
+            ray_serving.start(Settings(data_dir=tmp_path, port=port), ServingSizes(), None, 1)
+    certificate = tmp_path / "certificate.pem"
+    certificate.touch()
+    secret = Settings(data_dir=tmp_path, tls_certificate=certificate)
+    with pytest.raises(UserError, match="without TLS"):
+        ray_serving.start(secret, ServingSizes(), "127.0.0.1:1", None)
