@@ -314,7 +314,8 @@ class Attribution:
         name = self.sensor_name(jump.direction, jump.kind)
         if any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):
             return alarms
-        alarm = Alarm("sensor", name, jump.since, now, "warning", jump.size, jump.std, jump.size)
+        rivals = tuple(self.sensor_name(rival, self.model.kinds[int(np.argmax(rival != 0))]) for rival in jump.rivals)
+        alarm = Alarm("sensor", name, jump.since, now, "warning", jump.size, jump.std, jump.size, alternatives=rivals)
         return [*alarms, alarm]
 
     def _drifted(self, state: TrackerState) -> list[MeasurementFault]:
@@ -386,6 +387,7 @@ class Attribution:
             name = f"{'|'.join(left)}.{kind}"
             if not any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):
                 fresh = Alarm("sensor", name, alarm.onset, now, "warning", peak=alarm.peak)
+                fresh = replace(fresh, alternatives=alarm.alternatives)
                 out.append(self._sensor_updated(fresh, state, now))
         return out
 

@@ -126,6 +126,10 @@ class Jump:
     std: float
     since: int  # ns
     kind: str
+    rivals: tuple[FloatArray, ...] = ()  # other directions that explain the same windows about as well, each (H,)
+
+
+RIVALS = 2  # that are told of a jump
 
 
 def update(
@@ -370,7 +374,8 @@ def _test_jumps(
         direction = model.directions[best]
         kind = model.kinds[int(np.argmax(direction))]
         told, by = (slope[best], curvature[best]) if bounded == 1.0 else (along[best], information[best])
-        jump = Jump(direction, float(told / by), float(by**-0.5), int(since[best]), kind)
+        rivals = _rivals(model, ratio, slope / curvature, best)
+        jump = Jump(direction, float(told / by), float(by**-0.5), int(since[best]), kind, rivals)
         slope = curvature = trend = trend_curvature = np.zeros_like(slope)
     return (
         replace(
@@ -378,6 +383,24 @@ def _test_jumps(
         ),
         jump,
     )
+
+
+def _rivals(model: DeviationModel, ratio: FloatArray, size: FloatArray, best: int) -> tuple[FloatArray, ...]:
+    """Directions of other channels than the `best` one whose jump explains the windows about as well, best first.
+
+    ratio, size: of a jump along each direction, (V,).  Only differences between channels are determined: wheels of a
+    bogie that are late may look like sensors of that bogie that are early.
+    """
+    found = [model.directions[best]]
+    for v in np.argsort(-ratio).tolist():
+        if ratio[v] < ratio[best] - model.rules.rival or len(found) > RIVALS:
+            break
+        direction = model.directions[v]
+        kind = model.kinds[int(np.argmax(direction))]
+        apart = not any(np.any((direction != 0) & (other != 0)) for other in found)
+        if apart and kind in ("gain", "delay") and abs(size[v]) >= model.jump_limit(kind):
+            found.append(direction)
+    return tuple(found[1:])
 
 
 def _reopen_jumped(belief: Belief, model: DeviationModel, cross: FloatArray, jump: Jump) -> Belief:

@@ -69,6 +69,9 @@ class JumpRules:
         3.0, "log-likelihood ratio from which a channel is followed faster; derived: by chance in one of 70", 2.0, 4.5
     )
     onset: float = rule(3.0, "log-likelihood ratio that dates a jump; chosen: above chance", 2.0, 5.0)
+    rival: float = rule(
+        3.0, "log-likelihood ratio within which another jump is named, too; derived: one in 20", 2.0, 4.5
+    )
     gain: float = rule(0.01, "jump of a gain without an alarm; chosen: electronics", 0.005, 0.02)
     delay: float = rule(3e-4, "s, jump of a delay without an alarm; chosen: a third of a sample at 1 kHz", 1e-4, 6e-4)
     gain_drift: float = rule(0.03, "of a gain, slow, without an alarm; chosen: 2 % a month are usual", 0.02, 0.05)
