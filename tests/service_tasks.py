@@ -41,6 +41,8 @@ def misbehave(how: str, emit: Emit[int]) -> str:
 
 
 if __name__ == "__main__":  # a parent that is killed: starts a worker, writes down its process, waits
-    worker: Worker[int, str] = Worker(misbehave, "hang", ProcessLimits(600, 600), "the work")
+    from tests import service_tasks
+
+    worker: Worker[int, str] = Worker(service_tasks.misbehave, "hang", ProcessLimits(600, 600), "the work")
     for pid in worker.messages():
         Path(sys.argv[1]).write_text(str(pid))

@@ -17,9 +17,10 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from types import ModuleType
 from typing import Any, Generic, TypeVar
 
 from sprung.service.errors import UserError
@@ -37,6 +38,7 @@ POLL_SECONDS = 0.1
 START_SECONDS = 600.0  # to import what a task needs: seconds of work, minutes where the machine has no time
 END_SECONDS = 5.0  # a process that was killed is gone long before
 PR_SET_PDEATHSIG = 1
+_starting = threading.Lock()
 
 
 class WorkerFailed(RuntimeError):
@@ -99,7 +101,8 @@ class Worker(Generic[Message, Result]):
         )
         self._started = time.monotonic()
         self._begun: float | None = None
-        self._process.start()
+        with _without_program():
+            self._process.start()
         theirs.close()
 
     @property
@@ -192,6 +195,19 @@ def tie(parent: int) -> int:
         os._exit(1)
     python_can_alone()
     return parent
+
+
+@contextmanager
+def _without_program() -> Iterator[None]:
+    """A new process imports the module of its task, and not the program of this one as well: that may be Ray's, which
+    takes a second, or a script of somebody who uses Sprung, which would run again."""
+    with _starting:
+        program = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = program
 
 
 def _run(

@@ -44,6 +44,23 @@ def test_messages_arrive_in_order_and_then_the_result() -> None:
     assert gone(worker.pid)
 
 
+def test_the_program_that_starts_a_worker_is_not_run_again(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"  # without `if __name__ == "__main__"`
+    script.write_text(
+        "import sys\n"
+        "print('program')\n"
+        "from sprung.service.processes.worker import ProcessLimits, Worker\n"
+        "from tests.service_tasks import count\n"
+        "worker = Worker(count, 3, ProcessLimits(silence_seconds=60, seconds=60), 'the work')\n"
+        "print(*worker.messages(), worker.result, sys.modules['__main__'].__file__ == __file__)\n"
+    )
+    path = os.pathsep.join(filter(None, [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")]))
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, check=True, env=os.environ | {"PYTHONPATH": path}
+    )
+    assert done.stdout.splitlines() == ["program", "0 1 2 done True"]
+
+
 @pytest.mark.parametrize(
     ("how", "error", "told"),
     [
