@@ -66,6 +66,7 @@ OF_SPEED = (
 )
 OF_MEMORY = (*(Factor("z", 1), Factor("z * abs(z)", 2), Factor("z**2", 2), Factor("z**3", 3), Factor("abs(z)", 1)),)
 _SIMPLE = ("", "d", "abs(d)", "d**2", "v", "abs(v)")  # factors that may stand beside one with a value of its own
+_ONE_AT_REST = {"cos(d / L)", "exp(-(d / L)**2)", "exp(-(v / U)**2)"}
 _LINEAR = {("d", ""), ("", "v")}  # spring and damper
 
 
@@ -120,9 +121,18 @@ def _forms() -> Iterator[Shape]:
             yield Shape(first, second) if first.text else Shape(second)
     simple = [factor for factor in (*powers_d, *OF_RATE) if factor.text in _SIMPLE]
     for own, beside in product((*OF_LENGTH, *OF_SPEED), simple):
-        yield Shape(own, beside)
+        yield Shape(own if beside.text else _from_rest(own), beside)
     for own in OF_MEMORY:
         yield from (Shape(own, beside, memory=True) for beside in (NOTHING, *OF_DEFLECTION[:2], OF_RATE[1]))
+
+
+def _from_rest(factor: Factor) -> Factor:
+    """A factor alone as a force that is nothing at rest.
+
+    A constant beside it would be a preload, which no record of the motion shows; it would move the equilibrium instead,
+    and the spring with it.
+    """
+    return replace(factor, text=f"({factor.text} - 1)") if factor.text in _ONE_AT_REST else factor
 
 
 def formula_cost(parts: int) -> float:

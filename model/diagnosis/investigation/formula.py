@@ -53,26 +53,29 @@ def formula_of(problem: Problem, base: Fit, unnamed: Trial, held: HeldOut) -> tu
 def _accepted(
     problem: Problem, base: Fit, trials: list[Trial], unnamed: Trial, held: HeldOut
 ) -> tuple[Trial | None, str]:
-    """The formula that is accepted, or the reason why none is."""
-    best = _best_accepted(problem, base, trials, unnamed, held)
-    if best is None:
+    """The simplest formula near the best of those that explain as much as the unnamed force, or why there is none.
+
+    A formula with one value more that the recording does not determine, such as a * cos(d / L) instead of a * d**2, may
+    lead by chance; it is no reason against the other.
+    """
+    explaining = [trial for trial in trials if _explains(problem, base, trial, unnamed, held)]
+    if not explaining:
         return None, _NO_FORMULA
-    doubt = doubt_of(problem, best, trials)
-    return (None, doubt) if doubt else (best, "")
+    near = [t for t in explaining if t.evidence > explaining[0].evidence - problem.rules.report.naming_margin]
+    near.sort(key=lambda trial: len(trial.term.parameters))  # stable: of equally many values by evidence
+    doubts = [(trial, doubt_of(problem, trial, trials)) for trial in near]
+    return next(((trial, "") for trial, doubt in doubts if not doubt), (None, doubts[0][1]))
 
 
-def _best_accepted(problem: Problem, base: Fit, trials: list[Trial], unnamed: Trial, held: HeldOut) -> Trial | None:
-    """The formula of highest evidence that explains as much as the unnamed force and leaves little of the misfit."""
+def _explains(problem: Problem, base: Fit, trial: Trial, unnamed: Trial, held: HeldOut) -> bool:
+    """Whether a formula explains as much as the unnamed force and leaves little of the misfit."""
     rules = problem.rules.formula
-    for trial in trials:
-        if not problem.process_noise and excess_chi_square(problem, trial.fit) > rules.leaves * excess_chi_square(
-            problem, base
-        ):
-            continue
-        explains = trial.evidence >= unnamed.evidence - rules.slack and trial.gain >= rules.explains * unnamed.gain
-        if trial.finished and explains and not trial.fit.bounded and not held.compare(unnamed.fit, trial.fit).refuted:
-            return trial
-    return None
+    if not problem.process_noise and excess_chi_square(problem, trial.fit) > rules.leaves * excess_chi_square(
+        problem, base
+    ):
+        return False
+    explains = trial.evidence >= unnamed.evidence - rules.slack and trial.gain >= rules.explains * unnamed.gain
+    return trial.finished and explains and not trial.fit.bounded and not held.compare(unnamed.fit, trial.fit).refuted
 
 
 def _promising(problem: Problem, base: Fit, search: FormulaSearch, candidates: list[Candidate]) -> bool:
