@@ -194,6 +194,8 @@ class SelectionRules:
     further: int = rule(3, "candidates tried for a runner-up where none was close; chosen", 1, 6)
     chance: float = rule(4.0, "standard deviations; derived: one noise in 30 000 exceeds it", 3.0, 6.0)
     unnamed_ratio: float = rule(1.3, "times a named law, that an unnamed force explains; chosen", 1.1, 1.7)
+    unnamed_sure: float = rule(1.1, "the same, where its evidence is plainly higher; chosen", 1.05, 1.2)
+    unnamed_margin: float = rule(12.0, "evidence, that is plainly higher; chosen: odds of 400 to 1", 6.0, 20.0)
     stronger: float = rule(1.1, "times the damper that a law of shares asks for, as a second start; chosen", 1.02, 1.5)
     hint: float = rule(0.02, "of a law's strength at which its first step is taken; chosen", 0.005, 0.1)
     still: float = rule(0.05, "of the fitted part's motion, below which nothing is judged; chosen", 0.02, 0.1)

@@ -39,7 +39,7 @@ RIPPLES = (1.5, 2.2, 3.0, 4.0, 5.5, 7.5, 10.0)  # periods of a force ripple per 
 
 
 def _ripple(wave: float) -> _Basis:
-    return lambda x, y: [np.sin(wave * x), np.cos(wave * x)]
+    return lambda x, y: [np.sin(wave * x), np.cos(wave * x) - 1]  # nothing at rest
 
 
 def trials() -> dict[str, _Basis]:

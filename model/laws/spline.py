@@ -163,6 +163,7 @@ class LatentForce:
             confused_with=(),
             sentence="a force that no law of the catalogue explains; its map is reported",
             named=False,
+            listed=False,
         )
 
     def map(self, points: tuple[int, int] = (61, 41)) -> ForceMap:

@@ -7,6 +7,7 @@ import pytest
 
 from sprung.model.laws import SpringDamper, observe
 from sprung.model.laws.base import Motion
+from sprung.model.laws.basis import trials
 from sprung.model.laws.grammar import OF_DEFLECTION, OF_RATE, Factor, Shape, forms, formula_cost, law_of
 from sprung.model.laws.trajectory import along
 
@@ -24,6 +25,17 @@ def test_every_shape_is_a_law_with_trials_along_a_motion() -> None:
         if not law.memory:
             force = law.force(Motion(D, V, TIME), trials[0], SpringDamper(4e5, 2e4))
             assert force.shape == D.shape and np.any(force)
+
+
+def test_a_force_is_nothing_at_rest() -> None:
+    """A constant would be a preload: it would move the equilibrium, and the stiffness around it."""
+    rest = Motion(np.zeros(1), np.zeros(1), np.zeros(1))
+    for form in forms():
+        law = law_of((form,))
+        if not law.memory:
+            assert law.force(rest, law.shapes(SEEN)[0], SpringDamper(4e5, 2e4)) == pytest.approx(0.0)
+    for name, basis in trials().items():
+        assert np.array(basis(np.zeros(1), np.zeros(1))) == pytest.approx(0.0), name
 
 
 def test_units_make_the_product_a_force() -> None:

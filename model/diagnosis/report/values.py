@@ -9,6 +9,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.state import InputFault
 from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
+from sprung.model.diagnosis.response.harmonic_balance import LawForces
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, PlausibleRules
 from sprung.model.laws import ElementLaw, reversal_step
@@ -28,21 +29,34 @@ def figures(names: Sequence[str], per_sensor: FloatArray) -> FitFigures:
 def deviations(system: System, fit: Fit) -> FloatArray:
     """Standard deviations of the log-ratios, (P,).
 
-    The division between an unnamed force and the spring and damper beside it is a convention: their values are
-    uncertain by the change that the whole force would cause.
+    The division between a force that no law of the catalogue explains and the spring and damper beside it is a
+    convention: their values are uncertain by what the force would change them.
     """
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0))[: len(system.parameters)]
     for i, term in enumerate(fit.forces.terms if fit.forces is not None else ()):
-        if term.law.named or fit.forces is None:
+        if term.law.listed or fit.forces is None:
             continue
-        d, v = fit.forces.deflection[:, i], fit.forces.rate[:, i]
-        force = np.std(fit.forces.force[:, i] + term.equivalent[0] * d + term.equivalent[1] * v)
-        for j, parameter in enumerate(system.parameters):
-            if parameter.element == term.location and parameter.quantity != "mass":
-                along = np.std(d if parameter.quantity == "stiffness" else v)
-                value = parameter.nominal * np.exp(fit.point.theta[j])
-                sigma[j] = np.hypot(sigma[j], force / max(along * value, 1e-300))
+        for quantity, share in _linear_shares(fit.forces, i).items():
+            for j, parameter in enumerate(system.parameters):
+                if parameter.element == term.location and parameter.quantity == quantity:
+                    value = parameter.nominal * np.exp(fit.point.theta[j])
+                    sigma[j] = np.hypot(sigma[j], share / max(value, 1e-300))
     return sigma
+
+
+def _linear_shares(forces: LawForces, index: int) -> dict[str, float]:
+    """Stiffness and damping that may belong to a force: of a formula its own, of an unnamed force all of it.
+
+    A surface is estimated beside spring and damper and has none of its own.
+    """
+    term, d, v = forces.terms[index], forces.deflection[:, index], forces.rate[:, index]
+    force = forces.force[:, index] + term.equivalent[0] * d + term.equivalent[1] * v
+    if term.law.named:
+        columns = np.column_stack([d - np.mean(d), v - np.mean(v)])
+        stiffness, damping = np.abs(np.linalg.lstsq(columns, force, rcond=None)[0])
+        return {"stiffness": float(stiffness), "damping": float(damping)}
+    size = float(np.std(force))
+    return {name: size / max(float(np.std(along)), 1e-300) for name, along in (("stiffness", d), ("damping", v))}
 
 
 def reported_parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ...]:

@@ -324,11 +324,18 @@ def gain_together(problem: Problem, base: Fit, terms: Sequence[Term], iterations
 
 
 def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> list[Trial]:
-    """Trials by evidence, but an unnamed force leads only if it explains far more than every named candidate."""
+    """Trials by evidence, but an unnamed force leads only if it explains far more than every named candidate.
+
+    More is enough where its evidence is plainly higher: the best of the laws is then not the true one.
+    """
     if not trials or trials[0].named:
         return trials
     named = [t for t in trials if t.named]
-    if named and trials[0].explains < rules.unnamed_ratio * named[0].explains:
+    if not named:
+        return trials
+    plainly = trials[0].evidence > named[0].evidence + rules.unnamed_margin
+    ratio = rules.unnamed_sure if plainly else rules.unnamed_ratio
+    if trials[0].explains < ratio * named[0].explains:
         return [named[0], *[t for t in trials if t is not named[0]]]
     return trials
 

@@ -14,6 +14,7 @@ from sprung.benchmarks.open_catalogue import OpenLaw, simulated
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.api import Options, Report, diagnose
 from sprung.model.diagnosis.investigation import formula_trial
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.compete import Trial
@@ -24,7 +25,7 @@ from sprung.service.cli.export import export
 from sprung.service.diagnosis.improved import improved_text
 from sprung.service.diagnosis.own_laws import write_laws
 from sprung.service.report.forces import force_figure
-from tests.diagnosis_cases import MadeRecord, quarter_car, simulate
+from tests.diagnosis_cases import STIFFNESS, MadeRecord, quarter_car, simulate
 from tests.named_laws import element_law
 
 
@@ -102,6 +103,15 @@ def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_
     leader, unnamed = trial(stop, 1000.0, 2), trial(force, gain, 18)
     led: dict[str | None, Trial | None] = {"force": unnamed, "stop": leader, None: None}
     assert formula_trial._force_to_express(state, [leader, unnamed]) is led[expected]
+
+
+def test_a_weak_quadratic_spring_is_one_unknown_force_and_no_stop() -> None:
+    """Stops leave no more than noise may leave; a smooth force says a quarter more, with certainty."""
+    report = diagnose(quarter_car(), simulate(lambda d, v: 8e5 * d * d, seconds=30.0, seed=3), Options())
+    assert report.verdict == "unknown_physics"
+    assert [(f.location, f.kind) for f in report.findings] == [("secondary", EffectKind.UNLISTED)]
+    value = {one.name: one for one in report.augmented}["secondary.stiffness"]
+    assert value.value == pytest.approx(STIFFNESS["secondary"], abs=3 * value.std)
 
 
 def test_a_law_of_the_catalogue_stays_one() -> None:
