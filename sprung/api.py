@@ -206,7 +206,7 @@ def track(system: System, recording: Recording, model: Identifies | None = None)
         whole = [window for window in windows if window.outcome != "dropped"]
         estimates: Iterator[Estimate] = iter(())
         if whole:
-            known = [engine.tracker.hard_faults(followed.state)] * len(whole)
+            known = [engine.tracker.known_faults(followed.state)] * len(whole)
             values, starts = np.stack([w.values for w in whole]), [w.start for w in whole]
             found, _ = engine.identify(values, starts=starts, known=known)
             estimates = iter(found)

@@ -106,7 +106,7 @@ class Onboard:
         found: list[Estimate] = []
         if whole:
             values, starts = np.stack([w.values for w in whole]), [w.start for w in whole]
-            known = [self.engine.tracker.hard_faults(self.state)] * len(whole)
+            known = [self.engine.tracker.known_faults(self.state)] * len(whole)
             found, _ = self.engine.identify(values, starts=starts, known=known)
         estimates = iter(found)
         for window in windows:
