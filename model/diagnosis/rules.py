@@ -256,7 +256,7 @@ class AcceptanceRules:
     alpha: float = rule(1e-3, "chance of a false finding before the held-out check; chosen: one recording", 1e-4, 1e-2)
     findings: int = rule(6, "that are sought at most; chosen: five, and one to see that there is none", 5, 8)
     minor_beside: float = rule(0.05, "of an earlier finding at the same place; chosen", 0.02, 0.1)
-    minor_elsewhere: float = rule(0.002, "of an earlier finding, elsewhere or in any case; chosen", 0.0005, 0.01)
+    minor_elsewhere: float = rule(0.002, "of the findings elsewhere together, or in any case; chosen", 0.0005, 0.01)
     minor_followed: float = rule(0.01, "of logarithmic gains; chosen: laws are simulated no better", 0.003, 0.03)
     idle: float = rule(0.05, "of what a finding explained at first, beside later ones; chosen", 0.01, 0.2)
     better_than_promised: float = rule(4.0, "times that a fit may exceed its first step's promise; chosen", 2.0, 8.0)

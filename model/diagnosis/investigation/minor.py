@@ -72,14 +72,16 @@ def is_minor(state: Investigation, trial: Trial) -> bool:
     even = (found.trial.gain for found in state.found if found.trial.term.law.everywhere)
     if trial.term.law.part and trial.gain < rules.minor_beside * max(even, default=0.0):
         return True  # material damping varies over frequency more than its law
+    least = rules.minor_followed if state.problem.process_noise else rules.minor_elsewhere
+    elsewhere = [found.trial.gain for found in state.found if found.trial.term.location != trial.term.location]
+    if trial.gain < least * sum(elsewhere):  # inaccuracies of all laws add up
+        return True
     for index, found in enumerate(state.found):
         if found.trial.term.location != trial.term.location:
-            least = rules.minor_followed if state.problem.process_noise else rules.minor_elsewhere
-            if trial.gain < least * found.trial.gain:
-                return True
-        elif not trial.named:
+            continue
+        if not trial.named:
             return True
-        elif state.problem.process_noise:
+        if state.problem.process_noise:
             left = float(np.sum(state.fit.noise.force**2))
             if trial.reduction < min(rules.minor_beside * found.trial.reduction, rules.most_left * left):
                 return True

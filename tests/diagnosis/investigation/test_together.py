@@ -147,6 +147,21 @@ def test_a_small_law_beside_another_is_minor_unless_it_explains_most_of_what_is_
     assert minor._is_minor_beside(state, 0, second) is is_one
 
 
+@pytest.mark.parametrize(("gain", "is_one"), [(71.0, True), (90.0, False)])
+def test_what_is_small_beside_all_laws_elsewhere_together_is_their_inaccuracy(gain: float, is_one: bool) -> None:
+    """A wheel flat of 4 um beside a stop and a clearance, each of which explains 20 000."""
+
+    def trial(gain: float, name: str, place: str) -> Any:
+        term = Term(find_law(name), place, tuple(1.0 for _ in find_law(name).parameters))
+        return SimpleNamespace(gain=gain, named=True, term=term)
+
+    found = tuple(
+        SimpleNamespace(trial=trial(2e4, name, place)) for name, place in (("bump_stop", "left"), ("clearance", "right"))
+    )
+    state: Any = SimpleNamespace(options=Options(), problem=SimpleNamespace(process_noise=False), found=found)
+    assert minor.is_minor(state, trial(gain, "wheel_flat", "wheel")) is is_one
+
+
 def test_the_statistic_of_a_stop_with_two_sides_is_that_of_the_weaker_side() -> None:
     narrow: Any = find_law("bump_stop")
     wide = narrow.wider
