@@ -156,7 +156,8 @@ def test_what_is_small_beside_all_laws_elsewhere_together_is_their_inaccuracy(ga
         return SimpleNamespace(gain=gain, named=True, term=term)
 
     found = tuple(
-        SimpleNamespace(trial=trial(2e4, name, place)) for name, place in (("bump_stop", "left"), ("clearance", "right"))
+        SimpleNamespace(trial=trial(2e4, name, place))
+        for name, place in (("bump_stop", "left"), ("clearance", "right"))
     )
     state: Any = SimpleNamespace(options=Options(), problem=SimpleNamespace(process_noise=False), found=found)
     assert minor.is_minor(state, trial(gain, "wheel_flat", "wheel")) is is_one
