@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import signal
-import socket
 import ssl
 import sys
 import threading
@@ -21,6 +20,7 @@ from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
 from sprung.service.access.notice import access_notice, announce_access, is_loopback
 from sprung.service.access.tokens import Tokens
+from sprung.service.api.listening import listen, scheme
 from sprung.service.api.server import make_server
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
@@ -66,7 +66,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
     with ExitStack() as stack:
         engine, following = stack.enter_context(numerics(loaded, settings))
         stack.enter_context(held(settings.data_dir))
-        listening = stack.enter_context(_listen(settings))
+        listening = stack.enter_context(listen(settings))
         core = build_core(settings, engine, following)
         stack.callback(core.close)
         notice = access_notice(settings, core.tokens.any or core.oidc is not None)
@@ -86,8 +86,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
             core.close()
 
         host, port = listening.getsockname()[:2]
-        scheme = "http" if settings.tls_certificate is None else "https"
-        announce(f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}")
+        announce(f"{scheme(settings)}://{f'[{host}]' if ':' in host else host}:{port}")
         if notice:
             announce_access(notice)
         try:
@@ -113,17 +112,6 @@ def check_access(settings: Settings) -> None:
 
 def _exit(_number: int, _frame: FrameType | None) -> NoReturn:
     sys.exit(0)
-
-
-def _listen(settings: Settings) -> socket.socket:
-    """The socket, before anything else is started, so that a port in use is a plain error."""
-    try:
-        found = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, _, _, _, address = found[0]
-        return socket.create_server(address[:2], family=family, backlog=1024)
-    except OSError as error:
-        detail = error.strerror or error
-        raise UserError(f"cannot listen on {settings.host}:{settings.port}: {detail}; choose another --port") from error
 
 
 def add_live_feeds(core: Core, feeds: Feeds) -> None:

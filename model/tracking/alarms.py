@@ -314,7 +314,7 @@ class Attribution:
         name = self.sensor_name(jump.direction, jump.kind)
         if any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):
             return alarms
-        rivals = tuple(self.sensor_name(rival, self.model.kinds[int(np.argmax(rival != 0))]) for rival in jump.rivals)
+        rivals = tuple(self.sensor_name(rival, self.model.kind_along(rival)) for rival in jump.rivals)
         alarm = Alarm("sensor", name, jump.since, now, "warning", jump.size, jump.std, jump.size, alternatives=rivals)
         return [*alarms, alarm]
 
@@ -386,8 +386,8 @@ class Attribution:
             out[i] = _closed(alarm, now)
             name = f"{'|'.join(left)}.{kind}"
             if not any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):
-                fresh = Alarm("sensor", name, alarm.onset, now, "warning", peak=alarm.peak)
-                fresh = replace(fresh, alternatives=alarm.alternatives)
+                rivals = alarm.alternatives
+                fresh = Alarm("sensor", name, alarm.onset, now, "warning", peak=alarm.peak, alternatives=rivals)
                 out.append(self._sensor_updated(fresh, state, now))
         return out
 

@@ -44,6 +44,10 @@ class DeviationModel:
     def size(self) -> int:
         return len(self.kinds)
 
+    def kind_along(self, direction: FloatArray) -> str:
+        """Kind of the deviations that change along a direction (H,); one direction has one kind."""
+        return self.kinds[int(np.argmax(direction != 0))]
+
     def common_value(self, values: FloatArray, among: BoolArray | None = None) -> FloatArray:
         """The median of the gains, and of the delays, (H,): a value common to all channels is not identifiable.
 

@@ -372,7 +372,7 @@ def _test_jumps(
     jump = None
     if best >= 0 and ratio[best] >= rules.evidence:
         direction = model.directions[best]
-        kind = model.kinds[int(np.argmax(direction))]
+        kind = model.kind_along(direction)
         told, by = (slope[best], curvature[best]) if bounded == 1.0 else (along[best], information[best])
         rivals = _rivals(model, ratio, slope / curvature, best)
         jump = Jump(direction, float(told / by), float(by**-0.5), int(since[best]), kind, rivals)
@@ -396,7 +396,7 @@ def _rivals(model: DeviationModel, ratio: FloatArray, size: FloatArray, best: in
         if ratio[v] < ratio[best] - model.rules.rival or len(found) > RIVALS:
             break
         direction = model.directions[v]
-        kind = model.kinds[int(np.argmax(direction))]
+        kind = model.kind_along(direction)
         apart = not any(np.any((direction != 0) & (other != 0)) for other in found)
         if apart and kind in ("gain", "delay") and abs(size[v]) >= model.jump_limit(kind):
             found.append(direction)

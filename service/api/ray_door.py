@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 from typing import Any
 
+from sprung.service.api.listening import open_socket
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.processes.imports import lasting_imports
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
 
 POLL_SECONDS = 0.02
-BACKLOG = 1024  # connections that wait to be taken
 
 
 def door_app(settings: Settings, sizes: ServingSizes, migrated: bool, compute: Any) -> Any:
@@ -43,9 +42,7 @@ class ListeningDoor:
         with lasting_imports():
             from sprung.service.api.server import make_server
         self._server = make_server(app, settings, lambda: None)
-        listening = bound(settings.host, settings.port)
-        listening.listen(BACKLOG)
-        self._serving = asyncio.create_task(self._server.serve([listening]))
+        self._serving = asyncio.create_task(self._server.serve([open_socket(settings)]))
         while not self._server.started:
             await self.check_health()
             await asyncio.sleep(POLL_SECONDS)
@@ -59,16 +56,3 @@ class ListeningDoor:
         """Take no more requests; returns when those that have come are answered."""
         self._server.should_exit = True
         await self._serving
-
-
-def bound(host: str, port: int) -> socket.socket:
-    """A socket at an address.  Raises OSError where another program has it."""
-    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    made = socket.socket(family, kind, protocol)
-    try:
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        made.bind(address)
-    except OSError:
-        made.close()
-        raise
-    return made

@@ -12,7 +12,8 @@ import threading
 import time
 from typing import Any
 
-from sprung.service.api.ray_door import ListeningDoor, bound, door_app
+from sprung.service.api.listening import listen
+from sprung.service.api.ray_door import ListeningDoor, door_app
 from sprung.service.errors import UserError
 from sprung.service.fleet.ray_head import RayHead
 from sprung.service.fleet.ray_replicas import ComputeReplica
@@ -96,10 +97,7 @@ def start(settings: Settings, sizes: ServingSizes, address: str | None, cores: i
         serve.start(http_options={"host": settings.host, "port": settings.port})
         serve.run(application(settings, sizes, migrated=True), name=APPLICATION, route_prefix="/")
         return None
-    try:
-        bound(settings.host, settings.port).close()
-    except OSError as error:
-        raise UserError(f"{settings.host}:{settings.port}: {error.strerror}") from error
+    listen(settings).close()  # an address in use is a plain error, before Ray starts
     head = RayHead(cores)
     serve.start(proxy_location="Disabled")
     serve.run(application(settings, sizes, migrated=True, listening=True), name=APPLICATION, route_prefix=None)

@@ -12,6 +12,7 @@ from typing import Any
 from sprung.service.access.notice import access_notice, announce_access
 from sprung.service.access.tokens import Tokens
 from sprung.service.api import ray_serving
+from sprung.service.api.listening import scheme
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.settings import settings_with
 from sprung.service.store import open_store
@@ -25,8 +26,7 @@ def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None,
     head = ray_serving.start(settings, sizes, address, workers)
     if notice:
         announce_access(notice)
-    scheme = "http" if settings.tls_certificate is None else "https"
-    place = f"{scheme}://{settings.host}:{settings.port}"
+    place = f"{scheme(settings)}://{settings.host}:{settings.port}"
     print(f"Sprung takes windows and estimates on {place}; Ctrl-C stops", flush=True)
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

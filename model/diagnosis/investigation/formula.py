@@ -58,13 +58,20 @@ def _accepted(
     A formula with one value more that the recording does not determine, such as a * cos(d / L) instead of a * d**2, may
     lead by chance; it is no reason against the other.
     """
-    explaining = [trial for trial in trials if _explains(problem, base, trial, unnamed, held)]
-    if not explaining:
-        return None, _NO_FORMULA
-    near = [t for t in explaining if t.evidence > explaining[0].evidence - problem.rules.report.naming_margin]
+    near: list[Trial] = []  # trials come by evidence
+    for trial in trials:
+        if near and trial.evidence <= near[0].evidence - problem.rules.report.naming_margin:
+            break
+        if _explains(problem, base, trial, unnamed, held):
+            near.append(trial)
     near.sort(key=lambda trial: len(trial.term.parameters))  # stable: of equally many values by evidence
-    doubts = [(trial, doubt_of(problem, trial, trials)) for trial in near]
-    return next(((trial, "") for trial, doubt in doubts if not doubt), (None, doubts[0][1]))
+    reason = ""
+    for trial in near:
+        doubt = doubt_of(problem, trial, trials)
+        if not doubt:
+            return trial, ""
+        reason = reason or doubt
+    return None, reason or _NO_FORMULA
 
 
 def _explains(problem: Problem, base: Fit, trial: Trial, unnamed: Trial, held: HeldOut) -> bool:
