@@ -21,7 +21,7 @@ from sprung.benchmarks import paper
 from sprung.service.errors import UserError
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "paper.md"
-BLOCK = re.compile(r"<!-- (?:rows|variants) (\w+) -->(.*?)<!-- end -->", re.DOTALL)
+BLOCK = re.compile(r"<!-- (?:rows|explained|variants) (\w+) -->(.*?)<!-- end -->", re.DOTALL)
 SEEDS = re.compile(r"seeds? ([\d, ]+)")
 CELL = re.compile(r"(-?[\d.]+(?:e[-+]?\d+)?)(?: ± ([\d.]+(?:e[-+]?\d+)?))?")
 DIGITS = 1e-3  # relative: what four printed digits leave open

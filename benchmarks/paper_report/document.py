@@ -19,7 +19,7 @@ from sprung.benchmarks.paper_report.comparisons import (
     comparisons_of_pairs,
     comparisons_of_tasks,
 )
-from sprung.benchmarks.paper_report.tables import name_of, seeds_of, table
+from sprung.benchmarks.paper_report.tables import explained_table, name_of, seeds_of, table
 from sprung.benchmarks.paper_report.targets import targets
 from sprung.benchmarks.paper_settings import EXTRA
 from sprung.benchmarks.paper_sources import is_current
@@ -91,6 +91,12 @@ def _rows_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     return f"{table(task, rows)}\n\n{_made(rows)}"
 
 
+def _explained_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    """R^2 of each state."""
+    del task, folder, before
+    return f"{explained_table(rows)}\n\n{_made(rows)}"
+
+
 def _against_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     del rows, before
     return comparisons(task, folder / "errors")
@@ -131,6 +137,7 @@ def _full_place(task: str, rows: Rows, folder: Path, before: str) -> str:
 
 KINDS: dict[str, Callable[[str, Rows, Path, str], str]] = {
     "rows": _rows_place,
+    "explained": _explained_place,
     "against": _against_place,
     "printed": _printed_place,
     "noisy": _noisy_place,

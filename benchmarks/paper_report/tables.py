@@ -50,6 +50,16 @@ def table(task: str, rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def explained_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Markdown table: R^2 of each state by method; methods without are left out."""
+    columns = list(dict.fromkeys(key for row in rows for key in row if key.startswith("R2 ")))
+    lines = head("method", *columns)
+    for method, same in by_method(rows).items():
+        if any(row.get(column) is not None for row in same for column in columns):
+            lines.append(line(method, *(cell(same, column) for column in columns)))
+    return "\n".join(lines)
+
+
 def seeds_of(rows: Sequence[dict[str, Any]]) -> str:
     """The seeds of rows, "0, 1, 2"."""
     return ", ".join(str(seed) for seed in sorted({int(row.get("seed", 0)) for row in rows}))

@@ -92,6 +92,18 @@ def test_only_the_places_that_are_named_are_written(tmp_path: Path) -> None:
         list(paper_report.run(tmp_path, document, only="variants train"))
 
 
+def test_r2_of_every_state_stands_on_the_page_and_is_made_again_from_there(tmp_path: Path) -> None:
+    for seed in (0, 1):
+        keep(tmp_path, "alps", seed, **{"R2 angle": 0.9 + 0.02 * seed, "R2 rate": 0.8})
+        keep(tmp_path, "zero", seed, SE=1.0)
+    document = tmp_path / "paper.md"
+    document.write_text("<!-- explained pendulum -->\n<!-- end -->\n")
+    paper_report.refresh(tmp_path, document)
+    found = {(cell.method, cell.column): cell for cell in rerun_paper.stated(document.read_text())}
+    assert found.keys() == {("alps", "R2 angle"), ("alps", "R2 rate")}
+    assert (found["alps", "R2 angle"].mean, found["alps", "R2 angle"].spread) == (0.91, 0.014)
+
+
 def test_rows_of_other_code_are_refused(tmp_path: Path) -> None:
     keep(tmp_path, "alps", 0, sources="other")
     document = tmp_path / "paper.md"
