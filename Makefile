@@ -116,11 +116,10 @@ fuzz: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "atheris>=3,<4"
 	$(BIN)/python -m tests.fuzz.guided --seconds $(FUZZ_SECONDS)
 
+# AUDIT="--vulnerability-service osv" asks the other database
 audit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "pip-audit>=2.7,<3"
-	for lock in requirements requirements-fleet; do \
-		$(BIN)/pip-audit --strict --disable-pip --require-hashes --requirement $$lock.hashes.lock || exit 1; \
-	done
+	$(BIN)/python docs/audit.py $(AUDIT)
 
 bandit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "bandit>=1.8,<2"
@@ -130,9 +129,11 @@ docs: install-dev
 	$(BIN)/python docs/reference.py
 	$(BIN)/mkdocs build --quiet --strict --site-dir site
 
-# the pictures of docs/pages.md; needs Debian's chromium
+# the pictures of docs/pages.md, and in build/pictures those of every page, width and scheme; needs Debian's chromium
 pictures: install-dev
-	SPRUNG_SHOTS=docs/img/pages $(BIN)/python -m pytest -m slow tests/deploy/test_browser.py tests/deploy/test_morning.py
+	mkdir -p build/pictures
+	SPRUNG_SHOTS=build/pictures $(BIN)/python -m pytest -m slow tests/deploy/test_browser.py tests/deploy/test_morning.py
+	for picture in docs/img/pages/*.png; do cp "build/pictures/$${picture##*/}" "$$picture" || exit 1; done
 
 bench: install
 	$(BIN)/sprung bench $(NAME)

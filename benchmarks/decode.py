@@ -44,6 +44,8 @@ def run(
 ) -> Iterator[dict[str, Any]]:
     """One dict per figure: name, value, unit, peer, ratio, target.  `can` with `dbc`, and `mcap`, are files to read
     instead of the made ones, which are `seconds` long."""
+    if (can is None) != (dbc is None):
+        raise ValueError("bench decode: --can and --dbc belong together")
     with tempfile.TemporaryDirectory() as folder:
         database = _load(dbc) if dbc else _database()
         frames = _read_frames(Path(can)) if can else _frames(database, seconds)

@@ -49,6 +49,9 @@ class BenchTest:
 
 def run(seed: int = 1, laws: str = "", motions: str = ",".join(MOTIONS)) -> Iterator[dict[str, Any]]:
     """Yields one line per recording, and the counts."""
+    for given, known in ((laws, RIGS), (motions, MOTIONS)):
+        if unknown := [word for word in given.split(",") if given and word not in known]:
+            raise ValueError(f"bench naming: no {unknown[0]!r}; known are {', '.join(known)}")
     counts: dict[str, int] = dict.fromkeys(("right", "unknown", "wrong", "missed", "refused"), 0)
     for index, (name, rig) in enumerate(RIGS.items()):
         if laws and name not in laws.split(","):

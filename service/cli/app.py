@@ -412,17 +412,23 @@ def doctor(
     return run(system, weights, store, data_dir, can or [])
 
 
-@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+@app.command(  # a benchmark's own help is printed by it
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+)
 def bench(
     context: typer.Context,
     name: Annotated[str | None, typer.Argument(help="Without a name, all benchmarks are listed.")] = None,
 ) -> int:
     """Run a benchmark: one JSON line per figure.
 
-    Further arguments go to it (--budget full, --data DIR).
+    Further arguments go to it (--budget full, --data DIR); sprung bench NAME --help describes them.
     """
     one_thread_each()  # as the commands that it measures do; before anything numerical is loaded
-    from sprung.service.cli.bench import run
+    from sprung.service.cli.bench import HELP, run
+
+    if name in HELP:
+        typer.echo(context.get_help())
+        return 0
 
     return run(name, context.args)
 

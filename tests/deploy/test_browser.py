@@ -467,6 +467,7 @@ def test_an_upload_is_followed_to_its_report_and_what_was_found_is_put_to_use(
     page.get_by_role("button", name="Upload").click()
     page.locator("progress#sent").wait_for()
     page.locator("#outcome:has-text('diagnosis')").wait_for()
+    page.locator("#jobs:has-text('diagnosis')").wait_for()  # listed as soon as it is taken
     kept(page, "upload")
     page.wait_for_selector("a:has-text('report: missing physics')", timeout=180_000)  # the page has come anew
     page.click("a:has-text('report: missing physics')")

@@ -4,6 +4,12 @@
   const form = document.getElementById("upload");
   const bar = document.getElementById("sent");
   const told = document.getElementById("outcome");
+  const listJobs = async () => {
+    const answer = await fetch(location.pathname);
+    if (!answer.ok) return;
+    const page = new DOMParser().parseFromString(await answer.text(), "text/html");
+    document.getElementById("jobs").replaceWith(page.getElementById("jobs"));
+  };
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     const body = new FormData();
@@ -19,12 +25,14 @@
     request.onload = async () => {
       const answer = JSON.parse(request.responseText || "{}");
       if (request.status !== 202) { told.textContent = answer.detail || `refused (${request.status})`; return; }
+      listJobs();
       const now = await acts.follow(answer.id, (job) => {
         told.textContent = `${job.kind} ${acts.told(job)}`;
         bar.max = 1;
         bar.value = job.progress;
       });
       if (now.state === "done") setTimeout(() => location.reload(), 1200);
+      else listJobs();
     };
     request.onerror = () => { told.textContent = "the upload was interrupted"; };
     request.send(body);

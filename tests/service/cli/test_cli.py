@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sprung.benchmarks import BENCHMARKS
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.identification.estimator import Estimator, new_estimator
 from sprung.model.system import MANCHESTER, System
@@ -319,9 +320,38 @@ def test_options_of_a_benchmark_are_those_of_its_function() -> None:
     def run(task: str = "x", *, budget: str = "quick", seed: int = 1, data: Path | None = None) -> None: ...
 
     assert parse("b", run, ["y", "--budget", "full", "--seed=7"]) == (["y"], {"budget": "full", "seed": 7})
-    for wrong in (["--speed", "1"], ["--seed", "x"], ["--seed"], ["a", "b"]):
+    wrongs = (["--speed", "1"], ["--seed", "x"], ["--seed"], ["--seed="], ["a", "b"], ["--seed", "--data", "d"])
+    for wrong in (*wrongs, ["a", "--task", "b"], ["--seed", "1", "--seed", "2"]):
         with pytest.raises(UserError, match="bench b"):
             parse("b", run, wrong)
+
+
+def test_a_benchmark_names_what_it_needs_and_describes_its_own_options(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "silverbox"]) == 2
+    assert capsys.readouterr().err == "sprung: bench silverbox needs --data PATH; see sprung bench silverbox --help\n"
+    assert main(["bench", "sensitivity", "--budget", "all"]) == 2
+    assert capsys.readouterr().err.endswith("give quick or cases or full\n")
+    assert main(["bench", "decode", "--can", "x.blf"]) == 2
+    assert capsys.readouterr().err == "sprung: bench decode: --can and --dbc belong together\n"
+    assert main(["bench", "shaken", "--rigs", "nonsense"]) == 2
+    assert capsys.readouterr().err.startswith("sprung: bench shaken: nothing is measured with these arguments")
+    assert main(["bench", "naming", "--motions", "sine,nonsense"]) == 2
+    assert "'nonsense'" in capsys.readouterr().err
+    for asked in (["silverbox", "--help"], ["silverbox", "-h"], ["silverbox", "somewhere", "--help"]):
+        assert main(["bench", *asked]) == 0
+        out = capsys.readouterr().out
+        assert out.startswith("Usage: sprung bench silverbox --data PATH [--out PATH]\n")
+        assert "--data PATH  required" in out and "missing physics" in out
+    for asked in (["--help"], ["-h"], ["--help", "silverbox"]):
+        assert main(["bench", *asked]) == 0
+        assert "sprung bench NAME --help" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_every_benchmark_has_a_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", name, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"Usage: sprung bench {name}") and "Options:" in out
 
 
 def sprung(*arguments: str, **options: Any) -> subprocess.Popen[str]:
