@@ -96,11 +96,22 @@ def comparisons_of_tasks(rows: Rows, tasks: Sequence[str], method: str, over: st
     compared = {task: one for task, one in found.items() if one is not None}
     if len(compared) < len(tasks):
         return None
-    p = _adjusted({task: one.p_seeds for task, one in compared.items() if one.p_seeds is not None})
-    lines = head("task", f"{method} over {over}, {figure}", "of each seed", "p, seeds")
-    for task, one in compared.items():
+    return _table_by_seed("task", f"{method} over {over}, {figure}", compared)
+
+
+def comparisons_of_names(rows: Rows, task: str, pairs: dict[str, tuple[str, str]], figure: str) -> str | None:
+    """The same within one task, a line for each pair of methods by its name; pairs without rows are left out."""
+    found = {name: compare_by_seed(rows, task, *pair, figure) for name, pair in pairs.items()}
+    compared = {name: one for name, one in found.items() if one is not None}
+    return _table_by_seed("case", f"{figure}, ratio", compared) if compared else None
+
+
+def _table_by_seed(first: str, what: str, compared: dict[str, SeedComparison]) -> str:
+    p = _adjusted({name: one.p_seeds for name, one in compared.items() if one.p_seeds is not None})
+    lines = head(first, what, "of each seed", "p, seeds")
+    for name, one in compared.items():
         ratio = "-" if one.ratio is None else f"{one.ratio:.3g}"
-        lines.append(line(task, ratio, _each(one), f"{p[task]:.2g}" if task in p else "-"))
+        lines.append(line(name, ratio, _each(one), f"{p[name]:.2g}" if name in p else "-"))
     return "\n".join(lines)
 
 

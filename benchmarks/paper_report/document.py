@@ -16,6 +16,7 @@ from typing import Any
 from sprung.benchmarks.paper_report.comparisons import (
     comparisons,
     comparisons_by_seed,
+    comparisons_of_names,
     comparisons_of_pairs,
     comparisons_of_tasks,
 )
@@ -114,6 +115,14 @@ def _noisy_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     return comparisons_of_tasks(rows, VISUAL, "output_error", "alps", "PE_noisy") or before.strip("\n")
 
 
+def _poor_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    """Classical identification over ALPS where both start from an opening that is wrong."""
+    del folder
+    names = sorted({name_of(row).rpartition(" ")[0] for row in rows})
+    pairs = {f"{name}, output_error over alps": (f"{name} output_error", f"{name} alps") for name in names}
+    return comparisons_of_names(rows, task, pairs, "PE") or before.strip("\n")
+
+
 def _targets_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     del task, folder
     return targets(rows, before)
@@ -141,6 +150,7 @@ KINDS: dict[str, Callable[[str, Rows, Path, str], str]] = {
     "against": _against_place,
     "printed": _printed_place,
     "noisy": _noisy_place,
+    "poor": _poor_place,
     "targets": _targets_place,
     "variants": _variants_place,
     "full": _full_place,

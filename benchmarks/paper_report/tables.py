@@ -23,6 +23,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     "train": ("SE", "SE_relative", "PE", "PE_relative"),
     "train_changing": ("PE_relative", "error_at_bound", "SE", "PE", "windows", "samples", "iterations"),
     "train_drifting": ("PE_relative", "PE", "windows"),
+    "poor_opening": ("SE_affine", "SE_affine_relative", "PE", "PE_relative"),
     "kernels": (
         "first_eigenvalue_share", "eigenvalues_above_0.1_percent_of_first", "upper_half_band_share_of_row_spectrum",
         "row_minimum",
