@@ -65,6 +65,11 @@ class Recording:
         self._plausibility = PlausibilityCheck(channels, account, converter(channels))
 
     @property
+    def relative(self) -> bool:
+        """Its times count from 0, as far as it has been read."""
+        return self.account.relative
+
+    @property
     def stamped(self) -> bool:
         """Its times are those of sampling; on a bus they are those of arrival."""
         return self.path.suffix.lower() not in CAN_READERS

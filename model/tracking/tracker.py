@@ -174,10 +174,12 @@ class Tracker:
 
         A vehicle at standstill counts as monitored.  A running one does not where its inputs show no motion or are
         frozen, or where windows do not fit in a curve (with a zero error of the yaw rate every window is a curve).
-        Where it runs too slowly for an estimate, the last one stays valid for a while.
+        Where it runs too slowly for an estimate, the last one stays valid for a while.  A silent channel tells nothing
+        of whether it runs.
         """
         speed = np.nan if conditions is None else conditions.speed
-        runs = estimate.informative or speed > MOVING or bool(estimate.faults)
+        frozen = not estimate.running and any(fault.kind != "silent" for fault in estimate.faults)
+        runs = estimate.informative or speed > MOVING or frozen
         known = state.last is not None and (time_ns - state.last) * 1e-9 < self.settings.holding
         seen = coverage.update(state.coverage, usable=not runs and (known or not estimate.running or speed < CRAWLING))
         new = replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)

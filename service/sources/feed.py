@@ -14,12 +14,14 @@ from typing import Any
 from sprung.model import comfort
 from sprung.model.signals import Tally
 from sprung.model.tracking.tracker import TrackerState
+from sprung.service.errors import UserError
 from sprung.service.monitoring import rides
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import Batch, IdentifiedBatch
 from sprung.service.processes.worker import ProcessLimits
-from sprung.service.sources.reading import Ending, Reading, ReadRequest, prefetched, reading_of
+from sprung.service.sources.reading import Ending, Reading, ReadRequest, ReadWindows, prefetched, reading_of
+from sprung.service.store import work
 from sprung.service.times import AHEAD, now_ns, to_iso
 
 MOST_MINUTES = 1440  # of comfort that a summary keeps
@@ -121,7 +123,15 @@ def feed_file(
         return fed.vehicle or vehicle_of(vehicle, recorded, file_name or path.name)
 
     priority = Priority.LIVE if speed else Priority.BATCH
-    found = prefetched(_identified(pipeline, fed, reading, name, priority, check), 1, check)
+    def refuse(piece: ReadWindows) -> None:
+        other = _other_ride(pipeline, fed.vehicle, piece, recording_id)
+        if other is not None:
+            raise UserError(
+                f"{path}: its times count from 0, and from {to_iso(piece.windows[0].start)} on, as the file's own time "
+                f"has it, there is {other} of {fed.vehicle} already; say when it began (sprung replay --start)"
+            )
+
+    found = prefetched(_identified(pipeline, fed, reading, name, priority, check, refuse), 1, check)
     try:
         for one, tally in found:
             on_tally(tally)
@@ -145,6 +155,7 @@ def _identified(
     name: Callable[[str | None], str],
     priority: Priority,
     check: Callable[[], None],
+    refuse: Callable[[ReadWindows], None],
 ) -> Iterator[tuple[Callable[[], IdentifiedBatch] | None, Tally]]:
     """Windows as they are read, identified ahead where that is of use, with the tally until there; the ride's comfort
     is kept beside them."""
@@ -152,6 +163,8 @@ def _identified(
         found: Callable[[], IdentifiedBatch] | None = None
         if piece.windows:
             fed.vehicle = name(piece.vehicle)
+            if piece.assumed:
+                refuse(piece)
             for window in piece.windows:
                 if window.outcome != "dropped" and fed.ride is not None:
                     fed.ride.push(window.start, window.values)
@@ -159,6 +172,20 @@ def _identified(
             if not pipeline.knows_faults(fed.vehicle):
                 found = partial(_itself, found())
         yield found, piece.tally
+
+
+def _other_ride(pipeline: Pipeline, vehicle: str, piece: ReadWindows, recording_id: str | None) -> str | None:
+    """The name of another recording whose windows lie among those of a piece; None where there is none.
+
+    One of the same name and size is the same recording, sent again.
+    """
+    first, last = piece.windows[0].start, piece.windows[-1].start
+    with pipeline.store.read() as connection:
+        model_id = pipeline.engines.of(connection, vehicle).model_id
+        stored = work.recordings_between(connection, vehicle, model_id, first, last)
+        own = None if recording_id is None else work.get_recording(connection, recording_id)
+    others = [row.name for row in stored if own is None or (row.name, row.size_bytes) != (own.name, own.size_bytes)]
+    return others[0] if others else None
 
 
 def _itself(found: IdentifiedBatch) -> IdentifiedBatch:

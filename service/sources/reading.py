@@ -45,6 +45,7 @@ class ReadWindows:
     windows: list[Window]
     tally: Tally
     vehicle: str | None  # as recorded
+    assumed: bool = False  # when it began: its times count from 0, and nobody has said
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +102,13 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     whole = 0
     reported = time.monotonic()
 
+    def tell(some: list[Window]) -> None:
+        assumed = request.start is None and recording.relative
+        emit(ReadWindows(some, _copy(recording.tally), recording.vehicle, assumed))
+
     def report() -> None:
         nonlocal held, reported
-        emit(ReadWindows(held, _copy(recording.tally), recording.vehicle))
+        tell(held)
         held, reported = [], time.monotonic()
 
     for block in paced(recording.at_rate(system.sample_rate, beside.keep), request.speed):
@@ -113,12 +118,12 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
             if len(held) >= request.batch_windows:
                 report()
         if time.monotonic() - reported > SIGN_OF_LIFE_SECONDS:
-            emit(ReadWindows([], _copy(recording.tally), recording.vehicle))
+            tell([])
             reported = time.monotonic()
     last = windower.flush()
     held += [beside.to(window) for window in last]
     for first in range(0, len(held), request.batch_windows):
-        emit(ReadWindows(held[first : first + request.batch_windows], _copy(recording.tally), recording.vehicle))
+        tell(held[first : first + request.batch_windows])
     said = remarks(windower, whole + len(last))
     return Ending(
         recording.tally,

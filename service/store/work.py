@@ -158,6 +158,16 @@ def recording_at(connection: Connection, vehicle: str, time: int) -> RecordingRo
     return None if found is None else get_recording(connection, found)
 
 
+def recordings_between(
+    connection: Connection, vehicle: str, model_id: int, first: int, last: int
+) -> list[RecordingRow]:
+    """The recordings that windows of a vehicle with first <= start <= last came from."""
+    table = windows
+    of_vehicle = select(table.c.recording_id).where(table.c.vehicle_id == vehicle, table.c.model_id == model_id)
+    query = select(recordings).where(recordings.c.id.in_(of_vehicle.where(table.c.start_ns.between(first, last))))
+    return [RecordingRow(*row) for row in connection.execute(query)]
+
+
 def stored_files(connection: Connection) -> set[str]:
     """Names inside the upload folder that recordings refer to."""
     return set(connection.execute(select(recordings.c.file).where(recordings.c.file.is_not(None))).scalars())

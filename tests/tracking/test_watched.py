@@ -5,7 +5,7 @@ import pytest
 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
-from sprung.model.signals import Conditions, FloatArray
+from sprung.model.signals import Conditions, FloatArray, MeasurementFault
 from sprung.model.system import System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from tests.tracker_windows import EPOCH, constant, correlated, estimate, make_tracker, windows
@@ -73,6 +73,18 @@ def test_a_vehicle_that_runs_too_slowly_to_be_identified_is_watched_for_a_while_
         crawled = tracker.update(crawled, noisy, state.time or 0, Conditions(speed=2.0))
     assert tracker.health(state) == "check_function"
     assert tracker.health(crawled) == "ok"
+
+
+@pytest.mark.parametrize("running", [False, True])
+def test_a_silent_channel_does_not_say_that_a_vehicle_runs(running: bool) -> None:
+    """Standing, or too slow to be identified for less than two minutes."""
+    tracker, state, covariance = learned()
+    silent = (MeasurementFault("bogie1_1l", "silent", 0.0),)
+    told = estimate(np.zeros(24), covariance, informative=False, running=running, faults=silent)
+    for _ in range(40):
+        state = tracker.update(state, told, (state.time or 0) + SECOND)
+    assert state.coverage.monitored
+    assert [alarm.parameter for alarm in state.active] == ["bogie1_1l.silent"]
 
 
 def test_inputs_that_all_repeat_their_last_values_are_no_standstill(system: System, running: FloatArray) -> None:

@@ -1,6 +1,7 @@
 """From somebody's own file to the right result: other units, signs, separators, rates and times."""
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -114,6 +115,31 @@ def test_a_second_ride_that_begins_at_0_is_tracked_on(tmp_path: Path, capfd: pyt
     two = [str(tmp_path / "ride.csv")] * 2
     assert main(["replay", *two, "--start", "2026-09-23T08:00:00Z", *options]) == 2
     assert "give one FILE with it" in capfd.readouterr().err
+
+
+def test_another_ride_that_begins_at_0_at_the_same_file_time_is_refused(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As when several are copied or unpacked at once.  The same one again is the same ride."""
+    (tmp_path / "own.yaml").write_text(OWN)
+    write_own(tmp_path / "monday.csv")
+    lines = (tmp_path / "monday.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "tuesday.csv").write_text("".join(lines[:-100]))
+    options = ["--system", str(tmp_path / "own.yaml"), "--store", str(tmp_path / "a.db"), "--vehicle", "car", "--json"]
+
+    def replay(name: str, changed: float, *more: str) -> int:
+        os.utime(tmp_path / name, (changed, changed))
+        return main(["replay", str(tmp_path / name), *more, *options])
+
+    assert replay("monday.csv", 1_790_000_000) == 0
+    for later in (0, 2):
+        assert replay("tuesday.csv", 1_790_000_000 + later) == 2
+        err = capfd.readouterr().err
+        assert "there is monday.csv of car already; say when it began" in err
+    assert replay("monday.csv", 1_790_000_000) == 0
+    capfd.readouterr()
+    assert replay("tuesday.csv", 1_790_000_000, "--start", "2026-09-22T08:00:00Z") == 0
+    assert json.loads(capfd.readouterr().out.splitlines()[-1])["summary"]["fitting"]["untracked"] == 0
 
 
 def test_times_in_ms_that_nobody_declared_are_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
