@@ -1,9 +1,9 @@
 """`sensors`: one wrong measurement on a healthy vehicle. It must be named, and no spring accused.
 
 Rides of two minutes of `benchmarks/generator`; one channel reads too much, late, reversed, not at all, or another's,
-sends nothing or zeros, or a whole node sends nothing, from the first window or from the middle of the ride on.  Counted
-are alarms on springs and dampers, whether what is wrong is named (channel and kind), values that are off by more than
-three stated deviations without anything said, and rides at whose end what is left is monitored.
+sends nothing, zeros or much noise, or a whole node sends nothing, from the first window or from the middle of the ride
+on.  Counted are alarms on springs and dampers, whether what is wrong is named (channel and kind), values that are off
+by more than three stated deviations without anything said, and rides at whose end what is left is monitored.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ SIZES: dict[str, tuple[float, ...]] = {
     "zero": (0.0,),
     "silent node": (0.0,),
     "silent wheels": (0.0,),
+    "noisy": (5.0, 20.0),  # times its noise
 }
 CALLED = {"zero": "frozen", "silent node": "silent", "silent wheels": "silent"}  # where the kind's name is another
 NAMED_FROM = {"gain": 0.02, "delay": 1e-3}  # what the target asks to be named
@@ -193,6 +194,9 @@ def ride(
         first = round(fault.begins * SAMPLE_RATE)
         if fault.kind in ("frozen", "zero"):
             values[first:, fault.channel] = values[first, fault.channel] if fault.kind == "frozen" else 0.0
+        elif fault.kind == "noisy":
+            more = np.sqrt(fault.size**2 - 1) * noise[fault.channel]
+            values[first:, fault.channel] += more * rng.standard_normal(len(values) - first)
         elif fault.kind.startswith("silent"):
             values[first:, [fault.channel, *fault.others]] = np.nan
     return values, np.log(ratio)

@@ -96,7 +96,7 @@ class Conditions:
         return abs(self.lateral) > CURVE
 
 
-FaultKind = Literal["gain", "delay", "frozen", "saturated", "inverted", "swapped", "silent"]
+FaultKind = Literal["gain", "delay", "frozen", "saturated", "inverted", "swapped", "silent", "noisy"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,8 @@ class MeasurementFault:
 
     channel: str  # several that share it are joined by |
     kind: FaultKind
-    value: float  # gain: reading over truth; delay: s by which it reads late; frozen, saturated: the reading; else 0
+    # gain: reading over truth; delay: s by which it reads late; frozen, saturated: the reading; noisy: its noise
+    value: float  # else 0
     std: float = 0.0
 
 

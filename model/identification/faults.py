@@ -4,9 +4,9 @@ Redundant channels that contradict each other are looked at first (`contradictio
 and an exchange or a reversed sign that ends the contradiction is undone.  A gain, a delay or a load leaves a trace of
 its own in the residual (`calibration`): the one with the most evidence is taken back from the samples, and the window
 is refined again, until it fits or nothing helps.  What is too large for a linear step, or an exchange that contradicts
-nothing, is tried at the nominal values, where what the sensors should show depends on the inputs alone; a frozen or
-saturated sensor shows itself in its samples, and the window is refined without it.  A window explained this way is as
-informative about the springs as any other.
+nothing, is tried at the nominal values, where what the sensors should show depends on the inputs alone.  A frozen or
+saturated sensor shows itself in its samples, a noisy one in their spectrum, and the window is refined without it.  A
+window explained this way is as informative about the springs as any other.
 """
 
 from __future__ import annotations
@@ -128,7 +128,8 @@ class Explainer:
         stuck = {f.channel for f in faults if f.kind in STUCK}
         turned = tuple(f for f in faults if f.kind not in STUCK)
         undone = [Rearrangement.of(f, self.names) for f in turned]
-        seen = {int(b): self.stuck.channels(windows[b]) for b in rows}
+        noisy = any(f.kind == "noisy" for f in faults)
+        seen = {int(b): self._shown(windows[b], noisy=noisy) for b in rows}
         rows = rows[[{f.channel for f in seen[b]} == stuck for b in rows.tolist()]]
         if None in undone or not len(rows):  # one of several, which these windows may decide
             return {}
@@ -143,6 +144,12 @@ class Explainer:
         agree = np.flatnonzero(~self.contradictions.contradicted(restored))
         explained = self._by_steps(restored[agree], [causes[i] for i in agree])
         return {int(rows[agree[i]]): e for i, e in explained.items()}
+
+    def _shown(self, window: FloatArray, *, noisy: bool) -> tuple[MeasurementFault, ...]:
+        """What the samples of a window (T, C) show by themselves; noisy: noise, too."""
+        stuck = self.stuck.channels(window)
+        names = {fault.channel for fault in stuck}
+        return stuck + tuple(f for f in self.stuck.noisy(window) if noisy and f.channel not in names)
 
     def _can_lose(self, columns: IntArray) -> bool:
         """Whether windows can be refined without these channels."""
@@ -232,8 +239,11 @@ class Explainer:
 
     def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, FaultExplanation]:
         stuck = [self.stuck.channels(window) for window in windows]
-        plain = np.array([i for i, faults in enumerate(stuck) if not faults], dtype=np.int64)
-        found = {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
+        noisy = {i: its for i, faults in enumerate(stuck) if not faults and (its := self.stuck.noisy(windows[i]))}
+        at = list(noisy)
+        found = {at[k]: e for k, e in self._left_out(windows[at], list(noisy.values())).items()}
+        plain = np.array([i for i, faults in enumerate(stuck) if not faults and i not in found], dtype=np.int64)
+        found |= {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
         left = np.array([i for i in plain if i not in found], dtype=np.int64)
         if len(left) and len(self._clocks) > 1:
             again = self._by_steps(windows[left], [()] * len(left), step=self._clock_step)
@@ -427,6 +437,12 @@ class Explainer:
 
     def _without(self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]]) -> list[FaultExplanation]:
         """Windows (B, T, C) without the channels that the faults of each name."""
+        return self._or_as_they_are(windows, faults, self._left_out(windows, faults))
+
+    def _left_out(
+        self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]]
+    ) -> dict[int, FaultExplanation]:
+        """Those of the windows (B, T, C), by index, that fit without the channels that the faults of each name."""
         without, sensible = windows.copy(), []
         for b, its in enumerate(faults):
             columns = [self.names.index(name) for fault in its for name in fault.channel.split("|")]
@@ -434,7 +450,7 @@ class Explainer:
                 without[b][:, columns] = np.nan
                 sensible.append(b)
         explained = self._by_steps(without[sensible], [faults[b] for b in sensible])
-        return self._or_as_they_are(windows, faults, {sensible[i]: e for i, e in explained.items()})
+        return {sensible[i]: e for i, e in explained.items()}
 
     def _or_as_they_are(
         self,

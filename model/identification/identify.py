@@ -29,7 +29,7 @@ from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
 from sprung.model.work import WorkBudget
 
-SOUGHT = ("frozen", "saturated", "inverted", "swapped")  # known faults that windows are looked at for first
+SOUGHT = ("frozen", "saturated", "noisy", "inverted", "swapped")  # known faults that windows are looked at for first
 MANY = 24  # windows of a batch without start values, from which on some are refined first to start the others
 PILOTS = 6  # of these; their median is near, since batches are of one vehicle for the most part
 NOT_EXPLAINED = "whether a measurement is wrong was not looked into to the end: it takes longer than "

@@ -1,4 +1,4 @@
-"""Channels whose samples themselves show that they are frozen, saturated or silent."""
+"""Channels whose samples themselves show that they are frozen, saturated, noisy or silent."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import numpy as np
 from sprung.model.signals import FloatArray, MeasurementFault
 from sprung.model.system import System
 
-STUCK = ("frozen", "saturated")
+STUCK = ("frozen", "saturated", "noisy")  # refined without
 _FLAT = 0.8  # share of equal neighbours beyond which a channel is frozen
 _CLIPPED = 0.03  # share of samples at the very ends of the range, in runs, beyond which a channel is saturated
+_ABOVE = 0.75  # of the band: there, vehicles hardly move, and a spectrum shows a channel's noise
+_NOISY = 2.5  # times the noise of the file, and that of other channels of its unit; less hardly matters to a fit
 _SHAKEN = 10.0  # deviations of its noise that a sensor moves by when the vehicle runs; doors and people stay below
 
 
@@ -19,7 +21,9 @@ class StuckChannels:
     def __init__(self, system: System) -> None:
         self.names = [channel.name for channel in system.channels]
         self.inputs = len(system.inputs)
-        self.noise = np.array([channel.noise for channel in system.channels[self.inputs :]])
+        self.stated = np.array([channel.noise for channel in system.channels])
+        self.noise = self.stated[self.inputs :]
+        self.units = np.array([channel.unit for channel in system.channels])
 
     def channels(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
         """Those of one window (T, C) that are frozen or saturated."""
@@ -35,6 +39,20 @@ class StuckChannels:
                 if there.mean() > _CLIPPED and np.any(there[2:] & there[1:-1] & there[:-2]):
                     found.append(MeasurementFault(name, "saturated", float(end)))
                     break
+        return tuple(found)
+
+    def noisy(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
+        """Those of one window (T, C) that alone of their unit show more noise than the file states."""
+        taper = np.hanning(len(window) + 2)[1:-1]
+        spectrum = np.fft.rfft((window - window.mean(axis=0)) * taper[:, None], axis=0)
+        high = np.abs(spectrum[round(_ABOVE * len(spectrum)) :]) ** 2
+        std = np.sqrt(high.mean(axis=0) / (taper**2).sum())
+        ratio = std / np.maximum(self.stated, 1e-300)
+        found = []
+        for c in np.flatnonzero(ratio > _NOISY).tolist():
+            others = (self.units == self.units[c]) & np.isfinite(ratio) & (np.arange(len(ratio)) != c)
+            if not others.any() or ratio[c] > _NOISY * np.median(ratio[others]):
+                found.append(MeasurementFault(self.names[c], "noisy", float(f"{std[c]:.2g}")))
         return tuple(found)
 
     def silent(self, window: FloatArray) -> tuple[MeasurementFault, ...]:

@@ -29,7 +29,7 @@ from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
 from sprung.model.tracking.weather import WeatherModel
 
-HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped", "silent")
+HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped", "silent", "noisy")
 
 
 @dataclass(frozen=True, slots=True)
@@ -450,7 +450,7 @@ def counted(
     most: int,
     unseen: tuple[str, ...] | None = None,
 ) -> tuple[Stuck, ...]:
-    """Counts of frozen, saturated, silent, reversed and exchanged channels after a window that found some.
+    """Counts of frozen, saturated, silent, noisy, reversed and exchanged channels after a window that found some.
 
     unseen: parameters that the window did not identify; None: it could not be used.
     """
@@ -465,5 +465,8 @@ def counted(
         if key in now and unseen is not None:
             s = replace(s, unseen=tuple(name for name in s.unseen if name in unseen))
         if count > 0:
-            out.append(replace(s, count=count, value=now.get(key, s.value)))
+            value = now.get(key, s.value)
+            if s.kind == "noisy" and s.count:  # of one window it is not well known
+                value = float(np.sqrt(s.value**2 + (value**2 - s.value**2) / most))
+            out.append(replace(s, count=count, value=value))
     return tuple(out)

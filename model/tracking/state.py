@@ -62,7 +62,7 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class Stuck:
-    """A channel that windows found frozen, saturated, silent, reversed or exchanged."""
+    """A channel that windows found frozen, saturated, silent, noisy, reversed or exchanged."""
 
     channel: str
     kind: FaultKind
@@ -89,7 +89,7 @@ class TrackerState:
     changes: Changes
     fit: MisfitFloor
     calibration: DeviationRecord
-    stuck: tuple[Stuck, ...]  # frozen, saturated, silent, reversed or exchanged channels of the last windows
+    stuck: tuple[Stuck, ...]  # frozen, saturated, silent, noisy, reversed or exchanged channels of the last windows
     alarms: tuple[Alarm, ...]  # active and closed, oldest first
     coverage: Coverage = field(default_factory=Coverage)
     weather: Weather | None = None  # None: of an older format; it is learned from now on

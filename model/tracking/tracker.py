@@ -312,7 +312,7 @@ class Tracker:
         return {name: "|".join(channels) for name, channels in found.items()}
 
     def hard_faults(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
-        """Frozen, saturated, silent, reversed and exchanged channels."""
+        """Frozen, saturated, silent, noisy, reversed and exchanged channels."""
         reported = (s for s in state.stuck if s.count >= self.settings.rules.alarms.hard)
         return tuple(MeasurementFault(s.channel, s.kind, s.value) for s in reported)
 

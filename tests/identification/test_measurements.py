@@ -148,6 +148,22 @@ def test_a_window_that_does_not_fit_names_the_measurement_and_then_fits(
         assert np.sqrt(np.mean(z**2)) < 1.6
 
 
+def test_sensors_that_are_noisy_are_named_and_the_window_used_without_them(
+    system: System, identifier: Identifier
+) -> None:
+    healthy = record(6, 5)
+    for channels, noise in (([21], 0.15), ([3], 5e-3), ([16, 25], 0.2)):
+        wrong = healthy.copy()
+        wrong[:, channels] += noise * np.random.default_rng(8).standard_normal((len(wrong), len(channels)))
+        found = identifier.examine(windows(system, wrong, hop=100)[1:5], np.zeros(4, dtype=bool))
+        names = {system.channels[channel].name for channel in channels}
+        for estimate in found:
+            assert estimate.adequate
+            assert {(f.channel, f.kind) for f in estimate.faults} == {(name, "noisy") for name in names}
+            assert all(0.4 * noise < f.value < 1.8 * noise for f in estimate.faults)
+            assert np.sqrt(np.mean(estimate.log_ratio**2 / np.diag(estimate.covariance))) < 1.6
+
+
 @pytest.mark.parametrize("kind", ["frozen", "saturated"])
 def test_a_stuck_sensor_is_named_and_the_window_used_without_it(
     system: System, identifier: Identifier, kind: str
