@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ LONGEST_BRIDGE = 8  # own samples in a row that are interpolated before the filt
 JITTER = 3.0  # periods, standard deviation of the stamps about an even clock, above which there is none
 LOST = 0.35  # periods by which the stamps leave an even clock for long when a sample is missing
 SMOOTH = 33  # samples of the median for it
+MOST_FASTER = 100_000  # times the grid's rate that a channel may be: the filter has some 50 taps for each
 MOST_UP = 16  # of a rational ratio
 LATE = 64  # own samples that may come out of order
 SILENT = 5.0  # s after which the others no longer wait for a fast channel
@@ -73,7 +75,7 @@ def at_rate(
 ) -> Iterator[SampleBlock]:
     """The samples, fast channels decimated to the grid's rate, with a note in the account.
 
-    Errors: UnreadableRecording when every channel is much slower than the grid.
+    Errors: UnreadableRecording when every channel is much slower than the grid, or far faster.
     """
     source = iter(blocks)
     held: list[SampleBlock] = []
@@ -84,11 +86,16 @@ def at_rate(
     if not held:
         return
     clocks = _clocks(held, len(channels))
-    _refuse_slow(clocks, channels, sample_rate, account, path)
+    _refuse_far_off(clocks, channels, sample_rate, account, path)
+    fast = {index for index, found in clocks.items() if _far_faster(found, sample_rate)}
+    if fast:
+        left = [index for index in range(len(channels)) if index not in fast]
+        chosen = (_chosen(block, np.isin(block.channel, left)) for block in chain(held, source))
+        held, source = [], (block for block in chosen if len(block.time))
     reducers = {
         index: Reducer(found.period, sample_rate)
         for index, found in clocks.items()
-        if found.period * sample_rate * FASTER <= 1.0 and found.jitter < JITTER
+        if index not in fast and found.period * sample_rate * FASTER <= 1.0 and found.jitter < JITTER
     }
     if not reducers:
         yield from held
@@ -123,21 +130,30 @@ def _clocks(held: list[SampleBlock], channels: int) -> dict[int, SamplingClock]:
     return {index: one for index, one in found.items() if one is not None}
 
 
-def _refuse_slow(
+def _far_faster(clock: SamplingClock, sample_rate: float) -> bool:
+    """Whether a channel is too fast to be reduced to the grid's rate."""
+    return clock.period * sample_rate * MOST_FASTER < 1.0 and clock.jitter < JITTER
+
+
+def _refuse_far_off(
     clocks: dict[int, SamplingClock], channels: Sequence[Channel], sample_rate: float, account: Account, path: Path
 ) -> None:
-    """Complain about channels that are too slow for the grid; refuse when all are."""
+    """Complain about channels that are too slow for the grid, or far too fast; refuse when all are."""
     slow = {i: one for i, one in clocks.items() if one.period * sample_rate > 1.0 / (SLOWEST * 0.98)}
-    if not slow:
+    fast = {i: one for i, one in clocks.items() if _far_faster(one, sample_rate)}
+    if len(slow) + len(fast) < len(clocks) or not clocks:
+        for which, limit in ((slow, "slower than half of"), (fast, f"more than {MOST_FASTER} times faster than")):
+            if which:
+                names = ", ".join(channels[i].name for i in list(which)[:5])
+                rate = 1 / min(one.period for one in which.values())
+                account.note(f"{limit} {sample_rate:g} Hz, so left out: {names} ({rate:.3g} Hz)")
         return
-    period = min(one.period for one in slow.values())
-    if len(slow) < len(clocks):
-        names = ", ".join(channels[i].name for i in list(slow)[:5])
-        account.note(f"slower than half of {sample_rate:g} Hz, so left out: {names} ({1 / period:.3g} Hz)")
-        return
+    period = min(one.period for one in (slow or fast).values())
     hint = next(
         (f"if its times are in {unit}, set `time: {{unit: {unit}}}` in the system file; else " for unit, seconds in
          (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)) if 0.2 < period * seconds * sample_rate < 200.0), "")  # fmt: skip
+    if not slow:
+        hint = "if its times are in another unit, set `time: {unit: ...}` in the system file; else "
     raise UnreadableRecording(
         f"{path}: its samples come every {period:.4g} s, the system file has sample_rate: {sample_rate:g} Hz; "
         f"{hint}set sample_rate to {1 / period:.3g}"

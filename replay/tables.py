@@ -186,7 +186,10 @@ class Rows:
         self.time: int | None = None
         if time.rate is None:
             named = time_name(names, time, timed)
-            self.time = None if named is None else position(named, list(names))
+            try:
+                self.time = None if named is None else position(named, list(names))
+            except UnreadableRecording as error:
+                raise UnreadableRecording(f"{path}: {error}") from None
             if self.time is None:
                 raise no_time(path, names, time)
         found = find_columns(path, names, channels, account, csv=csv)

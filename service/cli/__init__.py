@@ -72,6 +72,8 @@ def describe(error: Exception) -> str:
         return f"{one_line(usage()).rstrip('.')}; see {command} --help"
     if isinstance(error, OSError) and error.strerror:
         return one_line(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
+    if isinstance(error, MemoryError):
+        return one_line(f"out of memory{f': {error}' if str(error) else ''}")
     if isinstance(error, ValueError):  # what every folder raises for input that cannot be used
         return one_line(str(error))
     if type(error).__name__ == "OperationalError":  # of SQLAlchemy: read-only, full, locked for long, out of reach

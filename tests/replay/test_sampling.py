@@ -46,6 +46,17 @@ def motion(t: FloatArray) -> FloatArray:
     return np.sin(2 * np.pi * 7 * t) + 0.2 * np.sin(2 * np.pi * 31 * t)
 
 
+def test_channels_of_another_world_are_left_out_or_refused_before_a_filter_is_made_for_them() -> None:
+    """Times in the wrong unit: a thousand million samples a second would need a filter of 4 GB."""
+    many = np.arange(3000)
+    time, _, slow, account = reduced(many * 1e-9, many * 1.0, seconds=5.0)
+    assert len(time) == 0 and len(slow) == 500
+    assert account.problems == ["more than 100000 times faster than 100 Hz, so left out: fast (1e+09 Hz)"]
+    alone = SampleBlock(many.astype(np.int64), np.zeros(3000, dtype=np.int32), many * 1.0)
+    with pytest.raises(UnreadableRecording, match=r"ride.csv: its samples come every 1e-09 s.* another unit"):
+        list(at_rate(iter([alone]), CHANNELS, GRID, Account(), Path("ride.csv")))
+
+
 @pytest.mark.parametrize("rate", [200.0, 250.0, 333.0, 1000.0, 2000.0, 10_000.0, 50_000.0])
 def test_fast_channels_keep_what_the_grid_can_hold_and_lose_what_would_alias(rate: float) -> None:
     t = np.arange(round(10 * rate)) / rate

@@ -279,6 +279,11 @@ def test_an_unexpected_error_is_one_line_too() -> None:
     assert describe(RuntimeError("a\nb")) == "unexpected RuntimeError: a b; SPRUNG_DEBUG=1 shows where"
 
 
+def test_memory_that_is_not_to_be_had_is_said_in_plain_words() -> None:
+    assert describe(MemoryError()) == "out of memory"
+    assert describe(MemoryError("Unable to allocate 4 GiB")) == "out of memory: Unable to allocate 4 GiB"
+
+
 def test_help_and_version_are_exit_status_zero(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("sprung 0.")
