@@ -65,7 +65,9 @@ def signals_of(path: Path, dbc: str | Path | Database | None = None, time: TimeC
 def _columns(path: Path, extension: str, time: TimeColumn, notes: list[str]) -> tuple[Named, TimeColumn]:
     """The columns of numbers, but for those of times, and where the times are; rows are counted when nowhere."""
     if extension in series.KINDS:
-        with series.opened(path) as columns:
+        with series.opened(path) as opened:
+            columns = [column for column in opened if not column.damage]
+            notes += [f"left out, since it cannot be read: {one.name} ({one.damage})" for one in opened if one.damage]
             return _series(path, _first_sheets(columns, notes), time, notes)
     if extension in TEXT_TABLES:
         layout, _ = csvtable.read_layout(path)

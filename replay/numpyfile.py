@@ -14,22 +14,31 @@ from numpy.typing import NDArray
 from sprung.replay.account import UnreadableRecording
 from sprung.replay.bounds import check_whole
 
-Arrays = Iterator[tuple[str, NDArray[Any]]]
+Arrays = Iterator[tuple[str, NDArray[Any] | str]]
 
 
 def arrays(path: Path) -> Arrays:
-    """Every array with its name; columns of structured ones as `name.field`.  Errors: UnreadableRecording."""
+    """Every array with its name, or why it cannot be read; columns of structured ones as `name.field`.
+
+    Errors: UnreadableRecording.
+    """
     try:
         if path.suffix.lower() == ".npz":
             with zipfile.ZipFile(path) as packed:
                 check_whole(path, (one.file_size for one in packed.infolist()))
             with np.load(path, allow_pickle=False) as content:
                 for name in content.files:
-                    found = _member(content, name)
+                    try:
+                        found = _member(content, name)
+                    except Exception as error:  # of whatever unpacks and parses: it costs itself
+                        yield name, str(error) or type(error).__name__
+                        continue
                     if found is not None:
                         yield from _fields(name, found)
         else:
             yield from _fields("data", np.load(path, allow_pickle=False))
+    except UnreadableRecording:
+        raise
     except (ValueError, OSError, EOFError, KeyError, SyntaxError, zipfile.BadZipFile) as error:
         raise UnreadableRecording(f"{path}: not a NumPy file that can be read: {error}") from error
 

@@ -23,7 +23,7 @@ from sprung.replay.bounds import check_piece, check_whole, mat_sizes
 from sprung.replay.extras import needed
 from sprung.replay.jsonkeys import load
 from sprung.replay.stamps import SECOND
-from sprung.replay.tables import MOST_COLUMNS, Column, EvenTimes, whole
+from sprung.replay.tables import MOST_COLUMNS, Column, EvenTimes, lost, whole
 
 DEEPEST = 8  # structures inside each other
 DEEPEST_GROUP = 64  # of HDF5: the library takes minutes for thousands of levels
@@ -33,8 +33,9 @@ DEEPEST_GROUP = 64  # of HDF5: the library takes minutes for thousands of levels
 def opened(path: Path) -> Iterator[list[Column]]:
     """The columns of a file, by its extension; they can be read while it is open."""
     with KINDS[path.suffix.lower()](path) as columns:
-        if not columns:
-            raise UnreadableRecording(f"{path}: it holds no series of numbers")
+        if all(column.damage for column in columns):
+            why = "; ".join(f"{column.name} cannot be read: {column.damage}" for column in columns[:3])
+            raise UnreadableRecording(f"{path}: it holds no series of numbers{f': {why}' if why else ''}")
         yield columns
 
 
@@ -245,7 +246,11 @@ def _lvm(path: Path) -> Iterator[list[Column]]:
 
 @contextmanager
 def _numpy(path: Path) -> Iterator[list[Column]]:
-    yield [column for name, values in numpyfile.arrays(path) for column in of_array(name, values)]
+    found = list(numpyfile.arrays(path))
+    damaged = [lost(name, values) for name, values in found if isinstance(values, str)]
+    yield [
+        column for name, values in found if not isinstance(values, str) for column in of_array(name, values)
+    ] + damaged
 
 
 KINDS: dict[str, Callable[[Path], Any]] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +50,18 @@ class Column:
     clock: EvenTimes | None = None
     sheet: int = 0  # of an array with more than two axes, from 0
     lacking: int = 0  # values that the file states and does not hold, or that are no numbers
+    damage: str = ""  # why it cannot be read at all, though others can; it has no values then
 
     @property
     def group(self) -> str:
         """What stands before the last part of its name."""
         cut = max(self.name.rfind("/"), self.name.rfind("."))
         return self.name[: cut + 1]
+
+
+def lost(name: str, damage: str) -> Column:
+    """A column that cannot be read."""
+    return replace(whole(name, np.zeros(0)), damage=damage)
 
 
 def whole(name: str, values: NDArray[Any], unit: str | None = None, clock: EvenTimes | None = None) -> Column:
@@ -226,6 +232,10 @@ def column_blocks(
     path: Path, columns: Sequence[Column], channels: Sequence[Channel], time: TimeColumn, account: Account
 ) -> Iterator[SampleBlock]:
     """Blocks of a file of whole series, which may have times of their own; in time order across them."""
+    for column in columns:
+        if column.damage:
+            account.problem(f"{column.name} cannot be read: {column.damage}")
+    columns = [column for column in columns if not column.damage]
     names = [column.name for column in columns]
     for column in columns:
         account.contents[column.name] = column.length

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from sprung.replay.account import UnreadableRecording
 from sprung.replay.stamps import SECOND
-from sprung.replay.tables import Column, EvenTimes, whole
+from sprung.replay.tables import Column, EvenTimes, lost, whole
 
 BORDER = b"    -1"
 TIME_RESPONSE, TIME = 1, 17  # function type; specific data type of the abscissa
 KINDS = {2: ("f4", 1), 4: ("f8", 1), 5: ("f4", 2), 6: ("f8", 2)}  # ordinate: type, numbers per value
+MOST_DAMAGED = 20  # damaged datasets that are told one by one
 DIRECTIONS = {0: "", 1: "+X", -1: "-X", 2: "+Y", -2: "-Y", 3: "+Z", -3: "-Z"}
 DIRECTIONS |= {4: "+RX", -4: "-RX", 5: "+RY", -5: "-RY", 6: "+RZ", -6: "-RZ"}
 _DATES = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S", "%d-%b-%y", "%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M:%S")
@@ -46,14 +47,15 @@ def columns(path: Path) -> list[Column]:
     data = path.read_bytes()
     if BORDER not in data[:4096]:
         raise UnreadableRecording(f"{path}: not a universal file (no '    -1' line at its beginning)")
-    try:
-        functions = [found for found in _datasets(data) if found is not None]
-    except (ValueError, IndexError, OverflowError) as error:
-        raise UnreadableRecording(f"{path}: a damaged dataset 58: {error}") from error
+    found = list(_datasets(data))
+    functions = [one for one in found if isinstance(one, _Function)]
+    damaged = [(number, str(one)) for number, one in enumerate(found, 1) if isinstance(one, ValueError)]
+    if not functions and damaged:
+        raise UnreadableRecording(f"{path}: a damaged dataset 58: {damaged[0][1]}")
     if not functions:
         raise UnreadableRecording(f"{path}: no time responses (dataset 58, function type 1) in it")
     places, titles = Counter(f.place for f in functions), Counter(f.title for f in functions)
-    out: list[Column] = []
+    out = [lost(f"dataset 58, number {number} of {len(found)},", why) for number, why in damaged[:MOST_DAMAGED]]
     for i, f in enumerate(functions):
         name = f.place if f.place and places[f.place] == 1 else f.title
         if not name or (name == f.title and titles[f.title] > 1):
@@ -66,8 +68,8 @@ def columns(path: Path) -> list[Column]:
     return out
 
 
-def _datasets(data: bytes) -> Iterator[_Function | None]:
-    """Every dataset 58 of a file; other datasets are passed over."""
+def _datasets(data: bytes) -> Iterator[_Function | ValueError | None]:
+    """Every dataset 58 of a file, or why it cannot be read; other datasets are passed over."""
     at = 0
     while (start := _border(data, at)) is not None:
         head, at = _line(data, start)
@@ -76,27 +78,36 @@ def _datasets(data: bytes) -> Iterator[_Function | None]:
             end = _border(data, at)
             at = len(data) if end is None else end
             continue
-        lines: list[bytes] = []
-        for _ in range(11):
-            line, at = _line(data, at)
-            lines.append(line)
-        if head[6:7].lower() == b"b" or kind[0] == b"58b":
-            size = int(head[31:43])
-            if size < 0:
-                raise ValueError(f"it states {size} bytes")
-            body, at = data[at : at + size], at + size
-            order = "<" if int(head[7:13]) == 1 else ">"
-            if int(head[13:19]) != 2:
-                raise ValueError("its numbers are not in IEEE 754")
-            yield _function(lines, _binary(lines, body, order))
+        begins = at
+        try:
+            function, at = _dataset(data, head, at)
+        except (ValueError, IndexError, OverflowError) as error:  # it costs itself
+            yield ValueError(str(error))
+            at = begins
         else:
-            end = _border(data, at)
-            body = data[at : len(data) if end is None else data.rindex(BORDER, at, end)]
-            yield _function(lines, _text(lines, body))
-            at = len(data) if end is None else end
-            continue
+            yield function
         end = _border(data, at)
         at = len(data) if end is None else end
+
+
+def _dataset(data: bytes, head: bytes, at: int) -> tuple[_Function | None, int]:
+    """The dataset 58 that begins at a byte, after its first line `head`, and where its values end."""
+    lines: list[bytes] = []
+    for _ in range(11):
+        line, at = _line(data, at)
+        lines.append(line)
+    if head[6:7].lower() == b"b" or head[:6].split()[0] == b"58b":
+        size = int(head[31:43])
+        if size < 0:
+            raise ValueError(f"it states {size} bytes")
+        body, at = data[at : at + size], at + size
+        order = "<" if int(head[7:13]) == 1 else ">"
+        if int(head[13:19]) != 2:
+            raise ValueError("its numbers are not in IEEE 754")
+        return _function(lines, _binary(lines, body, order)), at
+    end = _border(data, at)
+    last = len(data) if end is None else data.rindex(BORDER, at, end)
+    return _function(lines, _text(lines, data[at:last])), last
 
 
 def _border(data: bytes, at: int) -> int | None:

@@ -9,6 +9,7 @@ from typing import TypeVar
 
 from sprung.replay.inspection import Inspection
 from sprung.replay.record import Record
+from sprung.service.errors import UserError
 from sprung.service.processes.worker import ProcessLimits, Task, carried_out
 from sprung.service.settings import Settings, settings_with
 from sprung.service.sources.loading import InspectionRequest, RecordRequest, inspect_task, load_task
@@ -29,6 +30,17 @@ def own_limits(settings: Settings, path: Path) -> ProcessLimits | None:
     return ProcessLimits(inf, inf, settings.worker_memory_bytes, seconds, niceness=0)
 
 
+def readable(path: Path) -> None:
+    """Refuse what is no file that can be opened, before work is begun or a process started.
+
+    Errors: OSError, UserError (pipes and devices: opening them may wait for ever).
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise UserError(f"{path}: is no file; send what comes through a pipe to standard input, and give - instead")
+    with open(path, "rb"):
+        pass
+
+
 def load(request: RecordRequest) -> Record:
     """The record.  Raises UnreadableRecording, or UserError where the bounds are exceeded."""
     return _apart(load_task, request, request.path)
@@ -46,12 +58,10 @@ def windows(request: ReadRequest) -> Iterator[ReadWindows]:
 
 def reading(request: ReadRequest) -> Reading:
     """A recording that is about to be read.  Raises OSError where there is none."""
-    with open(request.path, "rb"):  # an absent file is reported without starting a process
-        pass
+    readable(request.path)
     return reading_of(request, own_limits(settings_with({}), request.path))
 
 
 def _apart(task: Task[Request, None, Result], request: Request, path: Path) -> Result:
-    with open(path, "rb"):  # an absent file is reported without starting a process
-        pass
+    readable(path)
     return carried_out(task, request, own_limits(settings_with({}), path), f"the reading of {path.name}")

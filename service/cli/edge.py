@@ -18,7 +18,7 @@ from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
 from sprung.service.cli import apart
-from sprung.service.cli.replay import readable
+from sprung.service.cli.apart import readable
 from sprung.service.errors import UserError
 from sprung.service.fleet.nats_broker import NatsLink
 from sprung.service.fleet.onboard import Onboard, OnboardCounts, OnboardSettings

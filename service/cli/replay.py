@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sprung.service.cli.apart import own_limits
+from sprung.service.cli.apart import own_limits, readable
 from sprung.service.cli.console import print_table, width_of_output
 from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.progress import progress
@@ -78,12 +78,6 @@ def _pipeline(settings: Settings, stack: ExitStack) -> Pipeline:
     compute = Compute(settings.compute_queue)
     stack.callback(compute.close)
     return Pipeline(engine, store, compute, vehicles_in_memory=settings.vehicles_in_memory)
-
-
-def readable(path: Path) -> None:
-    """Raise OSError now rather than after the files before it."""
-    with open(path, "rb"):
-        pass
 
 
 def _replay(pipeline: Pipeline, settings: Settings, options: ReplayOptions, named: Path, start: int | None) -> int:

@@ -9,10 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from sprung.service.cli.apart import readable
 from sprung.service.cli.console import print_table, width_of_output
 from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.progress import plain_progress
-from sprung.service.cli.replay import closing_line, health, incomplete_line, readable
+from sprung.service.cli.replay import closing_line, health, incomplete_line
 from sprung.service.cli.targets import check_folder
 from sprung.service.core import Core
 from sprung.service.main import Feeds, serve

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import pytest
 
 from sprung.model.signals import Channel
 from sprung.replay import UnreadableRecording
+from sprung.replay.listing import signals_of
 from tests.fuzz.seeds import TABLE, UNIVERSAL
 from tests.replay_files import LEFT, NUMBERS, RIGHT, read, uff58
 
@@ -112,6 +114,30 @@ def test_universal_files_that_hold_less_than_they_state_are_incomplete(
     recording, samples = read(tmp_path / "a.uff", channels=UNIVERSAL)
     assert recording.incomplete and any(told in line for line in recording.problems)
     assert len(samples[1][0]) == len(RIGHT) and len(samples[0][0]) > 100
+
+
+@pytest.mark.parametrize("content", [damaged(7, 0, "    x"), damaged(8, 0, f"{'x':>10}"), damaged(9, 0, f"{'x':>10}")])
+def test_a_damaged_dataset_of_a_universal_file_costs_itself(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.uff").write_bytes(content)
+    recording, samples = read(tmp_path / "a.uff", channels=UNIVERSAL)
+    assert recording.incomplete and len(samples[1][0]) == len(RIGHT)
+
+
+@pytest.mark.parametrize("packing", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_a_damaged_array_of_numpy_costs_itself(packing: int, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", packing) as file:
+        for name, values in {"time": SECONDS, "left": LEFT, "right": RIGHT}.items():
+            whole = io.BytesIO()
+            np.save(whole, values)
+            file.writestr(f"{name}.npy", whole.getvalue())
+        at = file.getinfo("left.npy").header_offset + 300
+    content = bytearray((tmp_path / "a.npz").read_bytes())
+    content[at : at + 40] = bytes(40)
+    (tmp_path / "a.npz").write_bytes(content)
+    recording, samples = read(tmp_path / "a.npz", channels=TABLE)
+    assert recording.incomplete and any("left cannot be read" in line for line in recording.problems)
+    assert np.array_equal(samples[1][1], RIGHT) and not len(samples[0][0])
+    assert any("left out, since it cannot be read: left" in note for note in signals_of(tmp_path / "a.npz").notes)
 
 
 @pytest.mark.parametrize("size", [-1, -600, -870, -900, -1200])

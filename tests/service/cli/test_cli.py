@@ -232,6 +232,16 @@ def test_what_cannot_be_done_is_one_line_and_exit_status_two(
     assert "Traceback" not in captured.err
 
 
+@pytest.mark.parametrize("command", [["replay"], ["inspect"], ["diagnose"], ["serve", "--replay"]])
+def test_a_pipe_is_refused_rather_than_waited_for(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPRUNG_DATA_DIR", str(tmp_path / "data"))
+    os.mkfifo(tmp_path / "ride.csv")
+    assert main([*command, str(tmp_path / "ride.csv")]) == 2
+    assert "ride.csv: is no file; " in capsys.readouterr().err
+
+
 def test_diagnose_prints_the_report_and_leaves_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     system, recording = tmp_path / "quarter-car.yaml", tmp_path / "ride.csv"
     system.write_text(SYSTEM)
