@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import re
 import secrets
 import threading
 import time
@@ -15,6 +16,7 @@ from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from sprung.model.text import CONTROL, UNSEEN
 from sprung.service.errors import NotFound, UserError
 from sprung.service.store import Store, audit, tokens
 from sprung.service.store.tokens import TokenRow
@@ -23,6 +25,7 @@ from sprung.service.times import NANOSECONDS, now_ns
 SCOPES = ("read", "ingest", "operate", "admin")
 IMPLIED = {"admin": {"read", "ingest", "operate", "admin"}, "operate": {"operate", "read"}}
 PREFIX = "sprung"
+FLEET = re.compile(r"([A-Za-z0-9][A-Za-z0-9._:-]*)?")  # how a vehicle's id may begin; empty: all
 REMEMBER_SECONDS = 5.0  # for which a token that was revoked may still be taken
 MOST_REMEMBERED = 1000
 SESSION_SECONDS = 12 * 3600.0
@@ -82,6 +85,10 @@ class Tokens:
             raise UserError(f"scope {', '.join(unknown) or 'is missing'}: known are {', '.join(SCOPES)}")
         if not name or len(name) > 128 or len(fleet) > 128:
             raise UserError("a token needs a name, and name and fleet have at most 128 characters")
+        if re.search(f"[{CONTROL}{UNSEEN}]", name):
+            raise UserError(f"a token's name cannot hold control characters: {name!r}")
+        if not FLEET.fullmatch(fleet):
+            raise UserError(f"no vehicle's id can begin with {fleet!r}: letters, digits and . _ : - only")
         if days is not None and not 0 < days < 36_500:
             raise UserError("a token lasts for more than 0 and less than 36500 days")
         token_id, secret = secrets.token_hex(6), secrets.token_urlsafe(32)

@@ -24,6 +24,7 @@ ERRORS = {
     409: ("Conflict", "A request with this Idempotency-Key is being worked on, or was another one.", "it is at work"),
     405: ("Method Not Allowed", "The path takes other methods.", "Method Not Allowed"),
     429: ("Too Many Requests", "More than the limit of one client; `Retry-After` says when.", "too many requests"),
+    414: ("URI Too Long", "A path and query longer than any client needs.", "path and query have more than 16 kB"),
     431: ("Request Header Fields Too Large", "More headers than any client needs.", "more than 100 headers"),
     507: ("Insufficient Storage", "No room is left for uploads or on the disk.", "no room for this upload"),
     422: ("Unprocessable Content", "The body or the query is wrong; the fields are named.", "parameter: is needed"),
@@ -39,7 +40,7 @@ def _problem(status: int) -> dict[str, Any]:
 
 
 PROBLEMS: dict[int | str, dict[str, Any]] = {
-    status: _problem(status) for status in (401, 403, 415, 421, 422, 429, 431, 503)
+    status: _problem(status) for status in (401, 403, 414, 415, 421, 422, 429, 431, 503)
 }
 
 

@@ -32,12 +32,15 @@ from sprung.service.settings import Settings
 log = logging.getLogger("sprung.requests")
 COOKIE = "sprung_session"
 REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
-HOST = re.compile(r"(?:\[([^\]]*)\]|([^:\[\]]*))(?::\d*)?")  # RFC 9110, 7.2; an IPv6 address stands in brackets
+HOST = re.compile(  # RFC 9110, 7.2; an IPv6 address stands in brackets
+    r"(?:\[([0-9A-Fa-f:.%]*)\]|([^:\[\]/?#@\\\s\x00-\x20\x7f]*))(?::\d*)?"
+)
 METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 UNSAFE = ("POST", "PUT", "PATCH", "DELETE")
 BURST_SECONDS = 2.0  # of the permitted rate that may come at once
 MOST_CLIENTS = 10_000
 MOST_HEADERS, MOST_HEADER_BYTES = 100, 32_000  # of one request: browsers send twenty, and cookies of 4 kB at most
+MOST_TARGET_BYTES = 16_000  # of path and query
 
 LOCAL, NOBODY = Actor(), Actor("nobody", frozenset())
 
@@ -126,6 +129,8 @@ class Guard:
             need = need_of(scope["method"], path)
             if len(scope["headers"]) > MOST_HEADERS or sum(map(_length, scope["headers"])) > MOST_HEADER_BYTES:
                 raise ApiProblem(431, f"more than {MOST_HEADERS} headers, or {MOST_HEADER_BYTES // 1000} kB of them")
+            if len(scope.get("raw_path") or b"") + len(scope["query_string"]) > MOST_TARGET_BYTES:
+                raise ApiProblem(414, f"path and query have more than {MOST_TARGET_BYTES // 1000} kB")
             if "transfer-encoding" in headers and "content-length" in headers:  # a proxy may believe the other one
                 raise ApiProblem(400, "give Content-Length or Transfer-Encoding, not both", headers=CLOSE)
             await self._check_host(headers)

@@ -56,7 +56,9 @@ def restore(
 def token_create(
     name: Annotated[str, typer.Argument(help="Who or what it is for.")],
     scope: Annotated[str, typer.Option("--scope", help="Of read, ingest, operate, admin, with commas.")] = "read",
-    fleet: Annotated[str, typer.Option("--fleet", help="Only vehicles whose ids begin so.")] = "",
+    fleet: Annotated[
+        str | None, typer.Option("--fleet", help="Only vehicles whose ids begin so; default: all vehicles.")
+    ] = None,
     days: Annotated[float, typer.Option("--days", min=0, help="Until it ends; 0: never.")] = 365.0,
     store: StoreUrl = None,
 ) -> int:

@@ -24,11 +24,13 @@ def opened(store: str | None) -> Iterator[Tokens]:
         found.close()
 
 
-def create(name: str, scopes: str, fleet: str, days: float, store: str | None) -> int:
+def create(name: str, scopes: str, fleet: str | None, days: float, store: str | None) -> int:
     """Make a token and print it; it cannot be shown again."""
+    if fleet == "":  # of a variable that nobody set: the token would be good for every vehicle
+        raise UserError("--fleet is empty; leave it out for a token for all vehicles")
     with opened(store) as tokens:
         wanted = [scope.strip() for scope in scopes.split(",") if scope.strip()]
-        text, row = tokens.create(name, wanted, fleet, days or None)
+        text, row = tokens.create(name, wanted, fleet or "", days or None)
     ends = "does not end" if row.expires_ns is None else f"ends {to_iso(row.expires_ns)}"
     print(text)
     print(f"token {row.id} of {name}: {', '.join(row.scopes)}; {ends}; it is shown this once", file=sys.stderr)

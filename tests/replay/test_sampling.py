@@ -48,11 +48,11 @@ def motion(t: FloatArray) -> FloatArray:
 
 def test_channels_of_another_world_are_left_out_or_refused_before_a_filter_is_made_for_them() -> None:
     """Times in the wrong unit: a thousand million samples a second would need a filter of 4 GB."""
-    many = np.arange(3000)
-    time, _, slow, account = reduced(many * 1e-9, many * 1.0, seconds=5.0)
+    many: FloatArray = np.arange(3000.0)
+    time, _, slow, account = reduced(many * 1e-9, many, seconds=5.0)
     assert len(time) == 0 and len(slow) == 500
     assert account.problems == ["more than 100000 times faster than 100 Hz, so left out: fast (1e+09 Hz)"]
-    alone = SampleBlock(many.astype(np.int64), np.zeros(3000, dtype=np.int32), many * 1.0)
+    alone = SampleBlock(many.astype(np.int64), np.zeros(3000, dtype=np.int32), many)
     with pytest.raises(UnreadableRecording, match=r"ride.csv: its samples come every 1e-09 s.* another unit"):
         list(at_rate(iter([alone]), CHANNELS, GRID, Account(), Path("ride.csv")))
 

@@ -21,6 +21,7 @@ from sprung.service.api.guard import COOKIE, Limiter
 from sprung.service.api.problems import ApiProblem
 from sprung.service.api.scopes import NEEDS, need_of
 from sprung.service.app import create_app
+from sprung.service.cli import main
 from sprung.service.core import Core, build_core
 from sprung.service.errors import NotFound, UserError
 from sprung.service.fleet.message import MEDIA_TYPE, Message, WindowEstimate, encode
@@ -271,6 +272,27 @@ def test_wrong_tokens_are_not_made(store: Store, scopes: list[str], days: float)
         Tokens(store).create("x", scopes, days=days)
 
 
+def test_what_no_vehicle_is_called_is_no_fleet_and_control_characters_are_no_name(
+    client: TestClient, store: Store, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for fleet in ("%", "north\x00", " north", "-north", "nörd"):
+        assert client.post("/tokens", json={"name": "x", "scopes": ["read"], "fleet": fleet}).status_code == 422, fleet
+        with pytest.raises(UserError, match="no vehicle's id can begin with"):
+            Tokens(store).create("x", ["read"], fleet)
+    with pytest.raises(UserError, match="control characters"):
+        Tokens(store).create("x\x1b[31m", ["read"])
+    assert Tokens(store).create("x", ["read"], "north-")[1].fleet == "north-"
+    command = ["token", "create", "x", "--store", f"sqlite:///{tmp_path / 'x.db'}", "--fleet"]
+    assert main([*command, ""]) == 2
+    assert capsys.readouterr().err.startswith("sprung: --fleet is empty; leave it out")
+
+
+def test_a_path_or_query_without_end_is_refused(client: TestClient) -> None:
+    for target in ("/" + "a" * 20_000, "/vehicles?q=" + "a" * 20_000):
+        answer = client.get(target)
+        assert answer.status_code == 414 and len(answer.content) < 25_000
+
+
 def test_people_sign_in_with_a_token_and_pages_send_them_there(client: TestClient, core: Core) -> None:
     text, row = core.tokens.create("anna", ["operate"])
     page = {"accept": "text/html"}
@@ -331,6 +353,10 @@ def test_names_that_were_pointed_here_are_not_served(client: TestClient, engine:
         ("attacker.example:80:localhost", 400),
         ("[[::1]]", 400),
         ("::1", 400),
+        ("attacker example", 400),
+        ("local/host", 400),
+        ("[attacker.example]", 400),
+        ("localhost#", 400),
         ("localhost:8000", 200),
         ("127.0.0.1:8000", 200),
         ("[::1]:8000", 200),
