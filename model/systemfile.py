@@ -28,6 +28,7 @@ _PATTERNS = {
 }
 MOST_PROBLEMS = 20  # that are listed
 DEEPEST = 50  # brackets or indents inside each other; a system file has six
+MOST_BYTES = 2_000_000  # a system file has 10 kB
 MOST_NODES = 20_000  # names and values, with those that aliases repeat; a vehicle has 600
 TOO_MANY = f"more than {MOST_NODES} names and values, with those that aliases repeat"
 
@@ -105,7 +106,11 @@ def read_system_file(path: str | Path) -> SystemFile:
     Errors: `SystemFileError`, one line: file, and of each problem line, key, what is wrong.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        with Path(path).open("rb") as file:  # a device never ends
+            content = file.read(MOST_BYTES + 1)
+        if len(content) > MOST_BYTES:
+            raise SystemFileError(f"{path}: is no system file: it has more than {MOST_BYTES // 1_000_000} MB")
+        text = content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise SystemFileError(f"{path}: cannot read the system file: {reason}") from None

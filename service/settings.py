@@ -22,6 +22,7 @@ from sprung.service.errors import UserError
 
 log = logging.getLogger("sprung")
 PREFIX = "SPRUNG_"
+MOST_DAYS = 100_000.0  # of what is kept: 270 years; times in ns have 64 bits
 OTHERS = ("TOKEN", "DEBUG")  # variables that are read elsewhere
 
 
@@ -50,7 +51,7 @@ Listed = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)]
 class Settings(BaseSettings):
     """Bounds are deliberate: every queue, body, file and label set of the service has one."""
 
-    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="ignore")
+    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="ignore", allow_inf_nan=False)
 
     data_dir: Path = Field(default_factory=default_data_dir)  # uploads, reports and the embedded store
     store: str | None = None  # SQLAlchemy URL; None: sprung.db in data_dir
@@ -129,11 +130,11 @@ class Settings(BaseSettings):
 
     retention_store_bytes: int | None = Field(default=None, gt=0)  # the oldest windows (PostgreSQL: months) go
     retention_windows_days: float = Field(
-        default=30.0, gt=0
+        default=30.0, gt=0, le=MOST_DAYS
     )  # by the time of the data and of storing, whichever is later
-    retention_minutes_days: float = Field(default=730.0, gt=0)  # one-minute roll-ups
+    retention_minutes_days: float = Field(default=730.0, gt=0, le=MOST_DAYS)  # one-minute roll-ups
     archive: str | None = None  # folder or address (s3://...) for windows that are old, as Parquet; None: they are gone
-    retention_uploads_days: float = Field(default=7.0, gt=0)
+    retention_uploads_days: float = Field(default=7.0, gt=0, le=MOST_DAYS)
 
     @field_validator("trusted_proxies")
     @classmethod

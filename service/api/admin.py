@@ -14,6 +14,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, Response
 from pydantic import Field
 
+from sprung.service.access.tokens import FLEET
 from sprung.service.api.access import CoreOf, read
 from sprung.service.api.actors import ActorOf
 from sprung.service.api.answers import json_response
@@ -36,7 +37,9 @@ class TokenBody(StrictBody):
 
     name: Annotated[str, Field(min_length=1, max_length=128, pattern=LINE_PATTERN)]
     scopes: Annotated[list[Scope], Field(min_length=1, max_length=4)]
-    fleet: Annotated[str, Field(max_length=128, description="vehicles whose ids begin so; empty: all")] = ""
+    fleet: Annotated[
+        str, Field(max_length=128, pattern=f"^{FLEET.pattern}$", description="vehicles whose ids begin so; empty: all")
+    ] = ""
     days: Annotated[float | None, Field(gt=0, lt=36_500, description="until it ends; null: never")] = 365.0
 
 

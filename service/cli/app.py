@@ -9,7 +9,7 @@ import typer
 
 from sprung import __version__
 from sprung.service.cli import fleet_commands, store_commands
-from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, vehicle_name
+from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, finite_speed, vehicle_name
 from sprung.service.cli.plain import PlainTyper
 from sprung.service.processes.imports import lasting_imports
 from sprung.service.processes.threads import hand_over_often, one_thread_each
@@ -73,7 +73,14 @@ def replay(
     weights: Weights = None,
     vehicle: Vehicle = None,
     speed: Annotated[
-        float, typer.Option("--speed", metavar="FACTOR", min=0, help="Times real time; 0: as fast as possible.")
+        float,
+        typer.Option(
+            "--speed",
+            metavar="FACTOR",
+            min=0,
+            help="Times real time; 0: as fast as possible.",
+            callback=finite_speed,
+        ),
     ] = 0.0,
     start: Start = None,
     json_lines: Json = False,
@@ -109,7 +116,13 @@ def serve(
     ] = None,
     speed: Annotated[
         float,
-        typer.Option("--speed", metavar="FACTOR", min=0, help="Of --replay: times real time; 0: as fast as possible."),
+        typer.Option(
+            "--speed",
+            metavar="FACTOR",
+            min=0,
+            help="Of --replay: times real time; 0: as fast as possible.",
+            callback=finite_speed,
+        ),
     ] = 0.0,
     can: Annotated[
         list[str] | None,

@@ -7,6 +7,7 @@ from pathlib import Path
 from sprung.model.text import counted
 from sprung.service.backup import back_up
 from sprung.service.backup import restore as put_back
+from sprung.service.cli.apart import readable
 from sprung.service.settings import settings_with
 
 
@@ -19,6 +20,7 @@ def run(target: Path, data_dir: Path | None, store: str | None) -> int:
 
 def restore(source: Path, data_dir: Path | None, store: str | None) -> int:
     """Put a back-up into a data folder."""
+    readable(source)
     settings = settings_with({"data_dir": data_dir, "store": store})
     found = put_back(settings, source)
     print(f"{settings.data_dir}: {counted(len(found.files), 'file')} as of {found.created}, of Sprung {found.version}")

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, vehicle_name
+from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, finite_speed, vehicle_name
 from sprung.service.cli.plain import PlainTyper
 from sprung.service.processes.threads import one_thread_each
 
@@ -53,7 +53,14 @@ def edge(
         float, typer.Option("--raw-seconds", min=0, help="Of raw samples around an alarm; 0: none.")
     ] = 60.0,
     speed: Annotated[
-        float, typer.Option("--speed", metavar="FACTOR", min=0, help="Of recordings, times real time; 0: no pause.")
+        float,
+        typer.Option(
+            "--speed",
+            metavar="FACTOR",
+            min=0,
+            help="Of recordings, times real time; 0: no pause.",
+            callback=finite_speed,
+        ),
     ] = 0.0,
     system: System = None,
     dbc: Dbc = None,

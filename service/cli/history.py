@@ -63,7 +63,7 @@ def _series(
     settings: Settings, engine: Engine, vehicle: str, between: tuple[int, int], resolution: float
 ) -> history.Series:
     """The history of a vehicle in a store, ns from and to, and in its archive; resolution: s, 0 for single windows."""
-    with closing(open_store(settings.store_url)) as store, store.read() as connection:
+    with closing(open_store(settings.store_url, there=True)) as store, store.read() as connection:
         if not fleet.vehicle_exists(connection, vehicle):
             raise UserError(f"{settings.store_url}: nothing is known of vehicle {vehicle!r}")
         model = fleet.known_model(connection, engine.digest, engine.description())

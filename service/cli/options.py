@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -40,6 +41,13 @@ def vehicle_name(name: str | None) -> str | None:
     if name is not None and name != (fit := vehicle_of(name, None, "vehicle")):
         raise UserError(f"--vehicle {name!r}: letters, digits and . _ : - only, at most 128; {fit!r} would do")
     return name
+
+
+def finite_speed(factor: float) -> float:
+    """An option's factor of real time.  Errors: `UserError`."""
+    if math.isinf(factor):
+        raise UserError("--speed: give 0 for as fast as possible")
+    return factor
 
 
 def time_of(option: str, text: str | None, default: int) -> int:

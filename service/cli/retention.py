@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from sprung.model.text import counted
 from sprung.service.housekeeping import Housekeeping
 from sprung.service.settings import settings_with
@@ -9,10 +11,10 @@ from sprung.service.store import open_store
 from sprung.service.times import to_iso
 
 
-def run(dry_run: bool, store: str | None) -> int:
+def run(dry_run: bool, data_dir: Path | None, store: str | None) -> int:
     """Delete old data, or list what would be deleted."""
-    settings = settings_with({"store": store})
-    opened = open_store(settings.store_url)
+    settings = settings_with({"data_dir": data_dir, "store": store})
+    opened = open_store(settings.store_url, there=True)
     try:
         housekeeping = Housekeeping(settings, opened)
         now = housekeeping.clock.now(keep=not dry_run)

@@ -28,6 +28,10 @@ def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[st
     for path in files:
         readable(path)
     settings = settings_with(options)
+    if settings.dbc is not None:  # rather than with the first recording
+        from sprung.replay.candecode import load_database
+
+        load_database(settings.dbc)
     set_up(settings.log_format, settings.log_level)
     check_folder(settings.data_dir)  # before the model is loaded, which takes seconds
 

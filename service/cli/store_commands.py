@@ -16,6 +16,7 @@ DataDir = Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", he
 
 def retention(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only list what would be deleted.")] = False,
+    data_dir: DataDir = None,
     store: StoreUrl = None,
 ) -> int:
     """Delete now what is too old to be kept.
@@ -24,7 +25,7 @@ def retention(
     """
     from sprung.service.cli.retention import run
 
-    return run(dry_run, store)
+    return run(dry_run, data_dir, store)
 
 
 def backup(
@@ -60,40 +61,43 @@ def token_create(
         str | None, typer.Option("--fleet", help="Only vehicles whose ids begin so; default: all vehicles.")
     ] = None,
     days: Annotated[float, typer.Option("--days", min=0, help="Until it ends; 0: never.")] = 365.0,
+    data_dir: DataDir = None,
     store: StoreUrl = None,
 ) -> int:
     """Make a token and print it."""
     from sprung.service.cli.token import create
 
-    return create(name, scope, fleet, days, store)
+    return create(name, scope, fleet, days, data_dir, store)
 
 
 @token.command("list")
-def token_list(json_lines: Json = False, store: StoreUrl = None) -> int:
+def token_list(json_lines: Json = False, data_dir: DataDir = None, store: StoreUrl = None) -> int:
     """List the tokens, without their secrets."""
     from sprung.service.cli.token import show
 
-    return show(json_lines, store)
+    return show(json_lines, data_dir, store)
 
 
 @token.command("rotate")
 def token_rotate(
     token_id: Annotated[str, typer.Argument(help="As `sprung token list` shows it.", metavar="ID")],
     hours: Annotated[float, typer.Option("--hours", min=0, help="For which the old one is still good.")] = 24.0,
+    data_dir: DataDir = None,
     store: StoreUrl = None,
 ) -> int:
     """Make a token like an old one, and let that end."""
     from sprung.service.cli.token import rotate
 
-    return rotate(token_id, hours, store)
+    return rotate(token_id, hours, data_dir, store)
 
 
 @token.command("revoke")
 def token_revoke(
     token_id: Annotated[str, typer.Argument(help="As `sprung token list` shows it.", metavar="ID")],
+    data_dir: DataDir = None,
     store: StoreUrl = None,
 ) -> int:
     """Make a token worthless."""
     from sprung.service.cli.token import revoke
 
-    return revoke(token_id, store)
+    return revoke(token_id, data_dir, store)

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from sprung.service.access.tokens import Tokens
 from sprung.service.errors import UserError
@@ -15,20 +16,20 @@ from sprung.service.times import optional_iso, to_iso
 
 
 @contextmanager
-def opened(store: str | None) -> Iterator[Tokens]:
+def opened(data_dir: Path | None, store: str | None, there: bool = True) -> Iterator[Tokens]:
     """The tokens of a store."""
-    found = open_store(settings_with({"store": store}).store_url)
+    found = open_store(settings_with({"data_dir": data_dir, "store": store}).store_url, there=there)
     try:
         yield Tokens(found)
     finally:
         found.close()
 
 
-def create(name: str, scopes: str, fleet: str | None, days: float, store: str | None) -> int:
+def create(name: str, scopes: str, fleet: str | None, days: float, data_dir: Path | None, store: str | None) -> int:
     """Make a token and print it; it cannot be shown again."""
     if fleet == "":  # of a variable that nobody set: the token would be good for every vehicle
         raise UserError("--fleet is empty; leave it out for a token for all vehicles")
-    with opened(store) as tokens:
+    with opened(data_dir, store, there=False) as tokens:
         wanted = [scope.strip() for scope in scopes.split(",") if scope.strip()]
         text, row = tokens.create(name, wanted, fleet or "", days or None)
     ends = "does not end" if row.expires_ns is None else f"ends {to_iso(row.expires_ns)}"
@@ -37,9 +38,9 @@ def create(name: str, scopes: str, fleet: str | None, days: float, store: str | 
     return 0
 
 
-def rotate(token_id: str, hours: float, store: str | None) -> int:
+def rotate(token_id: str, hours: float, data_dir: Path | None, store: str | None) -> int:
     """Make a token like an old one, and let that end."""
-    with opened(store) as tokens:
+    with opened(data_dir, store) as tokens:
         try:
             text, row, ends = tokens.rotate(token_id, hours)
         except LookupError as error:
@@ -49,9 +50,9 @@ def rotate(token_id: str, hours: float, store: str | None) -> int:
     return 0
 
 
-def revoke(token_id: str, store: str | None) -> int:
+def revoke(token_id: str, data_dir: Path | None, store: str | None) -> int:
     """Make a token worthless."""
-    with opened(store) as tokens:
+    with opened(data_dir, store) as tokens:
         try:
             tokens.revoke(token_id)
         except LookupError as error:
@@ -59,9 +60,9 @@ def revoke(token_id: str, store: str | None) -> int:
     return 0
 
 
-def show(json_lines: bool, store: str | None) -> int:
+def show(json_lines: bool, data_dir: Path | None, store: str | None) -> int:
     """List the tokens."""
-    with opened(store) as tokens:
+    with opened(data_dir, store) as tokens:
         rows = tokens.rows()
     for row in rows:
         state = "revoked" if row.revoked_ns is not None else optional_iso(row.expires_ns) or "no end"

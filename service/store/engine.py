@@ -87,10 +87,11 @@ class Store:
         self.engine.dispose()
 
 
-def open_store(url: str, migrated: bool = False) -> Store:
+def open_store(url: str, migrated: bool = False, *, there: bool = False) -> Store:
     """The store at a SQLAlchemy URL (or the path of an SQLite file), migrated to the newest schema.
 
     migrated: whoever hands out the work has done that already; looking takes longer than many a piece of work.
+    there: refuse an SQLite file that is not there, rather than begin one.
     Raises UserError when the URL is not one or the database cannot be opened.
     """
     if "://" not in url:
@@ -102,6 +103,8 @@ def open_store(url: str, migrated: bool = False) -> Store:
         if parsed.get_backend_name() not in UPSERT_DIALECTS:
             raise UserError(f"store {shown}: only {' and '.join(UPSERT_DIALECTS)} URLs are supported")
         if parsed.get_backend_name() == "sqlite":
+            if there and parsed.database and not Path(parsed.database).exists():
+                raise UserError(f"store {shown}: there is none; give the --data-dir or --store of the service")
             engine = _sqlite_engine(url, parsed.database)
         else:
             engine = _postgresql_engine(parsed)

@@ -95,3 +95,77 @@ def test_sigterm_while_it_starts_for_the_first_time_ends_it_at_once(tmp_path: Pa
     assert process.returncode in (0, -signal.SIGTERM)
     assert "Traceback" not in errors
     open_store(f"sqlite:///{tmp_path}/sprung.db").close()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["retention", "--dry-run"], ["retention"], ["token", "list"], ["token", "rotate", "x"], ["token", "revoke", "x"]],
+)
+def test_a_store_that_is_not_there_is_not_begun_by_what_only_looks_or_deletes(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for way in (["--data-dir", str(tmp_path / "typo")], ["--store", f"sqlite:///{tmp_path / 'typo' / 'x.db'}"]):
+        assert main([*command, *way]) == 2
+        assert capsys.readouterr().err.endswith("there is none; give the --data-dir or --store of the service\n")
+    assert not (tmp_path / "typo").exists()
+
+
+def test_retention_and_tokens_take_the_folder_that_the_service_takes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["token", "create", "x", "--data-dir", str(tmp_path)]) == 0
+    assert main(["token", "list", "--json", "--data-dir", str(tmp_path)]) == 0
+    assert '"name": "x"' in capsys.readouterr().out
+    assert main(["retention", "--dry-run", "--data-dir", str(tmp_path)]) == 0
+    assert "would be forgotten" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [
+        ("RETENTION_WINDOWS_DAYS", "inf"),
+        ("RETENTION_MINUTES_DAYS", "1e18"),
+        ("RETENTION_UPLOADS_DAYS", "200000"),
+        ("BODY_IDLE_SECONDS", "inf"),
+        ("HEADER_SECONDS", "nan"),
+    ],
+)
+def test_settings_beyond_what_a_clock_can_show_are_refused_by_name(
+    setting: str,
+    value: str,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv(f"SPRUNG_{setting}", value)
+    assert main(["token", "create", "x", "--data-dir", str(tmp_path)]) == 2
+    assert f"SPRUNG_{setting}" in capsys.readouterr().err
+
+
+def test_a_service_with_a_can_database_that_is_none_does_not_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bus.dbc").write_bytes(bytes(100) + b"\xff")
+    assert main(["serve", "--data-dir", str(tmp_path), "--port", "0", "--dbc", str(tmp_path / "bus.dbc")]) == 2
+    assert "bus.dbc: not a CAN database that can be read" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["replay", "x.csv"], ["serve"], ["edge", "x.csv"]])
+def test_a_speed_without_end_is_refused(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*command, "--speed", "inf"]) == 2
+    assert capsys.readouterr().err == "sprung: --speed: give 0 for as fast as possible\n"
+
+
+def test_a_back_up_through_a_pipe_is_refused_rather_than_waited_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "b.tar")
+    assert main(["restore", str(tmp_path / "b.tar"), "--data-dir", str(tmp_path / "d")]) == 2
+    assert "b.tar: is no file" in capsys.readouterr().err
+
+
+def test_a_system_file_without_end_is_refused_unread(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in (Path("/dev/zero"), tmp_path / "large.yaml"):
+        (tmp_path / "large.yaml").write_bytes(b"# long\n" * 300_000)
+        assert main(["system", str(path)]) == 2
+        assert "is no system file: it has more than 2 MB" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
-from sprung.service.store import Store, retention, work
+from sprung.service.store import Store, open_store, retention, work
 from sprung.service.store.schema import windows
 from tests.clocks import Clocks
 from tests.service_fakes import START, make_window
@@ -97,11 +97,12 @@ def test_a_clock_written_by_an_earlier_version_goes_on(tmp_path: Path) -> None:
 def test_a_preview_by_the_command_does_not_move_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPRUNG_DATA_DIR", str(tmp_path))
     path = tmp_path / "retention.json"
+    open_store(f"sqlite:///{tmp_path / 'sprung.db'}").close()
     Clocks(START).retention(path).now()
     before = path.read_bytes()
-    assert retention_command.run(dry_run=True, store=None) == 0
+    assert retention_command.run(dry_run=True, data_dir=None, store=None) == 0
     assert path.read_bytes() == before
-    assert retention_command.run(dry_run=False, store=None) == 0
+    assert retention_command.run(dry_run=False, data_dir=None, store=None) == 0
     assert path.read_bytes() != before
 
 
