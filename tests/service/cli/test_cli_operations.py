@@ -190,6 +190,9 @@ def test_doctor_tells_what_works_and_what_does_not(tmp_path: Path, capsys: pytes
 
 def test_export_of_an_unknown_vehicle_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", "nobody", "--store", str(tmp_path / "s.db")]) == 2
+    assert "s.db: there is none" in capsys.readouterr().err and not (tmp_path / "s.db").exists()
+    open_store(str(tmp_path / "s.db")).close()
+    assert main(["export", "nobody", "--store", str(tmp_path / "s.db")]) == 2
     assert "nothing is known of vehicle 'nobody'" in capsys.readouterr().err
     assert main(["export", "a", "--format", "xls"]) == 2
     assert main(["export", "a", "--since", "noon", "--store", str(tmp_path / "s.db")]) == 2
