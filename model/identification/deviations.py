@@ -92,7 +92,7 @@ def shared_directions(deviations: Sequence[Deviation]) -> FloatArray:
     """What several channels may have in common, as rows over the deviations (V, H), each once.
 
     The delay of a clock, of all clocks of a node, of all supports measured by one node; gain and delay of a support,
-    whose quantities come from one instrument.
+    whose quantities come from one instrument; the gain of all channels of a message, which have one reference.
     """
     kind = np.array([d.kind for d in deviations])
     group, node, support = (np.array([getattr(d, of) for d in deviations]) for of in ("group", "node", "support"))
@@ -104,6 +104,7 @@ def shared_directions(deviations: Sequence[Deviation]) -> FloatArray:
         (below, node),
         (below, support),
         (gain & (support >= 0), support),
+        (gain, group),
     ]
     rows = [among & (number == one) for among, number in parts for one in np.unique(number[among])]
     found = list(dict.fromkeys(tuple(row.tolist()) for row in rows if row.sum() > 1))

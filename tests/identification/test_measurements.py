@@ -239,6 +239,16 @@ def test_all_wheels_of_a_bogie_that_are_late_are_named_and_not_its_sensors(
     assert np.abs(mean / std).max() < 3.5
 
 
+def test_a_gain_that_all_channels_of_a_message_share_is_one_alarm(system: System, identifier: Identifier) -> None:
+    healthy = record(75, 9)
+    wrong = healthy.copy()
+    wrong[:, BOGIE] *= 1.05
+    tracker, state = tracked(system, identifier, after(healthy, wrong, 35))
+    assert [(a.kind, a.parameter) for a in state.alarms] == [("sensor", "bogie1_1l|bogie1_1r|bogie1_2l|bogie1_2r.gain")]
+    mean, std = tracker.posterior(state)
+    assert np.abs(mean / std).max() < 3.5
+
+
 def test_of_two_quantities_that_an_alarm_names_the_one_that_is_right_leaves_it(
     system: System, identifier: Identifier
 ) -> None:
