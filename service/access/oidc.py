@@ -19,11 +19,12 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode, urlsplit
+
+from cachetools import TTLCache
 
 from sprung.model.text import escaped
 from sprung.service.access import outside
@@ -57,7 +58,6 @@ class Begun:
     verifier: str
     callback: str
     to: str
-    ends: float  # time.monotonic()
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class Provider:
         self._audience = settings.oidc_audience or self._client
         self._claim = settings.oidc_claim
         self._grants = grants(settings.oidc_groups)
-        self._begun: OrderedDict[str, Begun] = OrderedDict()
+        self._begun: TTLCache[str, Begun] = TTLCache(MOST_BEGUN, BEGUN_SECONDS)
         self._configuration: tuple[float, dict[str, Any]] = (-1e9, {})
         self._keys: tuple[float, Any] = (-1e9, None)
         self._away: tuple[float, str] = (-1e9, "")  # when and how the provider failed last
@@ -96,9 +96,7 @@ class Provider:
         place = self._endpoint("authorization_endpoint")
         state, nonce, verifier = (secrets.token_urlsafe(32) for _ in range(3))
         with self._lock:
-            self._begun[state] = Begun(nonce, verifier, callback, to, time.monotonic() + BEGUN_SECONDS)
-            while len(self._begun) > MOST_BEGUN:
-                self._begun.popitem(last=False)
+            self._begun[state] = Begun(nonce, verifier, callback, to)
         challenge = base64.urlsafe_b64encode(hashlib.sha256(verifier.encode()).digest()).rstrip(b"=").decode()
         query = {
             "response_type": "code",
@@ -116,7 +114,7 @@ class Provider:
         """Who came back with a code, and where he wanted to go.  Raises Refused or Unreachable."""
         with self._lock:
             begun = self._begun.pop(state, None)
-        if begun is None or begun.ends < time.monotonic():
+        if begun is None:
             raise Refused("signing in was not begun here, or took too long; begin again")
         form = {
             "grant_type": "authorization_code",

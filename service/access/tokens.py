@@ -12,9 +12,12 @@ import re
 import secrets
 import threading
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+
+from cachetools import TTLCache
 
 from sprung.model.text import CONTROL, UNSEEN
 from sprung.service.errors import NotFound, UserError
@@ -71,7 +74,7 @@ class Tokens:
         self._store = store
         self._admin = None if admin_token is None else digest_of(admin_token)
         self._clock = clock
-        self._known: OrderedDict[str, tuple[float, TokenRow | None]] = OrderedDict()
+        self._known: TTLCache[str, TokenRow | None] = TTLCache(MOST_REMEMBERED, REMEMBER_SECONDS)
         self._sessions: dict[str, _Session] = {}  # by digest, the oldest first
         self._counted: tuple[float, bool] = (-1e9, False)
         self._lock = threading.Lock()
@@ -202,17 +205,12 @@ class Tokens:
         return Actor(row.name, frozenset(row.scopes), row.fleet)
 
     def _row(self, token_id: str) -> TokenRow | None:
-        now = time.monotonic()
-        with self._lock:
-            at, row = self._known.get(token_id, (-1e9, None))
-        if now - at < REMEMBER_SECONDS:
-            return row
+        with self._lock, suppress(KeyError):
+            return self._known[token_id]
         with self._store.read() as connection:
             row = tokens.get(connection, token_id)
         with self._lock:
-            self._known[token_id] = (now, row)
-            while len(self._known) > MOST_REMEMBERED:
-                self._known.popitem(last=False)
+            self._known[token_id] = row
         return row
 
     def _forget(self) -> None:

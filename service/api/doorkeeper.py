@@ -9,9 +9,11 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import time
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Iterable
 from typing import Protocol
+
+from cachetools import LRUCache
 
 from sprung.service.settings import Settings
 
@@ -147,14 +149,11 @@ class LeakyBuckets:
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
-        self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()  # events and when, by time.monotonic
+        self._levels: LRUCache[str, tuple[float, float]] = LRUCache(MOST_CLIENTS)  # events and when, by time.monotonic
 
     def add(self, client: str) -> None:
         """One more."""
         self._levels[client] = (self._level(client) + 1.0, time.monotonic())
-        self._levels.move_to_end(client)
-        if len(self._levels) > MOST_CLIENTS:
-            self._levels.popitem(last=False)
 
     def full(self, client: str) -> bool:
         """Whether there were more lately than are permitted."""

@@ -8,12 +8,12 @@ import math
 import random
 import re
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import quote, urlsplit
 
+from cachetools import LRUCache
 from prometheus_client import Histogram
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
@@ -86,7 +86,7 @@ class Guard:
         self._settings = settings
         self._tokens = tokens
         self._limiter = Limiter(settings.client_requests_per_second)
-        self._good: OrderedDict[str, bool] = OrderedDict()  # digests of tokens and sessions that were good lately
+        self._good: LRUCache[str, bool] = LRUCache(MOST_CLIENTS)  # digests of tokens and sessions that were good lately
         self._local = is_loopback(settings.host)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -182,8 +182,6 @@ class Guard:
         if not self._good.pop(credential, False):
             self._limiter.give(address)
         self._good[credential] = True
-        while len(self._good) > MOST_CLIENTS:
-            self._good.popitem(last=False)
         self._limiter.take(f"token {actor.name}")
         return actor, by_cookie
 
@@ -279,17 +277,15 @@ class Limiter:
     def __init__(self, rate: float) -> None:
         self._rate = rate
         self._most = max(1.0, BURST_SECONDS * rate)
-        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+        self._left: LRUCache[str, tuple[float, float]] = LRUCache(MOST_CLIENTS)
 
     def take(self, client: str) -> None:
         """Raises a 429 ApiProblem when a client asks too often."""
         now = time.monotonic()
-        left, at = self._left.pop(client, (self._most, now))
+        left, at = self._left.get(client, (self._most, now))
         left = min(self._most, left + (now - at) * self._rate)
         refused = left < 1.0
         self._left[client] = (left if refused else left - 1.0, now)
-        while len(self._left) > MOST_CLIENTS:
-            self._left.popitem(last=False)
         if refused:
             wait = str(math.ceil((1.0 - left) / self._rate))
             raise ApiProblem(429, f"more than {self._rate:g} requests a second", headers={"Retry-After": wait})

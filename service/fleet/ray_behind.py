@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+
+from cachetools import LRUCache
 
 from sprung.model.signals import MeasurementFault
 from sprung.service.errors import Busy, UserError
@@ -26,7 +27,7 @@ class RayBehind:
         """compute: handle of the deployment; batch: `serve.batch`, which runs in a replica only."""
         self._compute = compute
         self._form: WindowForm | None = None
-        self._faults: OrderedDict[str, tuple[MeasurementFault, ...]] = OrderedDict()  # where there are any
+        self._faults: LRUCache[str, tuple[MeasurementFault, ...]] = LRUCache(MOST_FAULTY)  # where there are any
         self._waiting, self._most = 0, sizes.queued * sizes.replicas
         # one more than there are replicas, so that none waits for the next; more, and batches stay small
         wait = {"batch_wait_timeout_s": sizes.batch_wait_seconds, "max_concurrent_batches": sizes.replicas + 1}
@@ -72,8 +73,6 @@ class RayBehind:
         self._faults.pop(taken.vehicle, None)
         if taken.faults:
             self._faults[taken.vehicle] = taken.faults
-            if len(self._faults) > MOST_FAULTY:
-                self._faults.popitem(last=False)
 
     async def _take_together(self, asked: list[_Asked]) -> list[IngestResult | UserError]:
         sent, known = zip(*asked, strict=True)

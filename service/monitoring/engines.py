@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
-from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+from cachetools import LRUCache, TTLCache
 from sqlalchemy import Connection
 
 from sprung.model.schema import SystemFile
@@ -49,9 +48,8 @@ class Engines:
         self._make = make
         self.shared = ServedModel(SERVICE_FILE, shared, model_id)
         self._own = own
-        self._kept = kept
-        self._held: OrderedDict[tuple[str, int], ServedModel] = OrderedDict()
-        self._lately: OrderedDict[str, tuple[float, ServedModel]] = OrderedDict()
+        self._held: LRUCache[tuple[str, int], ServedModel] = LRUCache(kept)
+        self._lately: TTLCache[str, ServedModel] = TTLCache(MOST_LATELY, LATELY_SECONDS)
         self._broken: dict[tuple[str, int], str] = {}
         self._lock = threading.Lock()
 
@@ -73,13 +71,8 @@ class Engines:
         return found
 
     def _note(self, found: Mapping[str, ServedModel]) -> None:
-        now = time.monotonic()
         with self._lock:
-            for vehicle, served in found.items():
-                self._lately[vehicle] = (now, served)
-                self._lately.move_to_end(vehicle)
-            while len(self._lately) > MOST_LATELY:
-                self._lately.popitem(last=False)
+            self._lately.update(found)
 
     def lately(self, store: Store, vehicle: str) -> ServedModel:
         """As `of`, out of memory where that was asked a few seconds ago.
@@ -87,8 +80,8 @@ class Engines:
         For identifying only: whoever stores looks again in his transaction (`ModelChanged`).
         """
         with self._lock:
-            at, served = self._lately.get(vehicle, (-LATELY_SECONDS, self.shared))
-        if time.monotonic() - at < LATELY_SECONDS:
+            served = self._lately.get(vehicle)
+        if served is not None:
             return served
         with store.read() as connection:
             return self.of(connection, vehicle)
@@ -108,12 +101,10 @@ class Engines:
         """One version of a vehicle's.  Raises UserError where there is none, or it does not belong to this service."""
         if version == SERVICE_FILE:
             return self.shared
-        key = (vehicle, version)
         with self._lock:
-            held = self._held.get(key)
-            if held is not None:
-                self._held.move_to_end(key)
-                return held
+            held = self._held.get((vehicle, version))
+        if held is not None:
+            return held
         row = vehicle_models.get_version(connection, vehicle, version)
         text = vehicle_models.text_of(connection, vehicle, version)
         if row is None or text is None:
@@ -126,8 +117,6 @@ class Engines:
         """Keep an engine for the next time."""
         with self._lock:
             self._held[vehicle, served.version] = served
-            while len(self._held) > self._kept:
-                self._held.popitem(last=False)
 
     def made(self, text: str, what: str) -> Engine:
         """The engine of a system file's text.  Raises UserError where it is not one of the same measurements."""

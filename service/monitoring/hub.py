@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+
+from cachetools import LRUCache
 
 from sprung.service.errors import Busy, TooManyOfOne
 from sprung.service.monitoring.processed import Batch
@@ -33,7 +35,7 @@ class Listener:
         self.ended = False  # given up for another one
         self._vehicle = vehicle
         self._wake = wake
-        self._news: OrderedDict[str, VehicleNews] = OrderedDict()
+        self._news: LRUCache[str, VehicleNews] = LRUCache(MOST_WAITING)
         self._lock = threading.Lock()
 
     def put(self, news: VehicleNews) -> None:
@@ -42,8 +44,6 @@ class Listener:
             return
         with self._lock:
             self._news[news.vehicle] = news
-            while len(self._news) > MOST_WAITING:
-                self._news.popitem(last=False)
         self._wake()
 
     def end(self) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
+
+from cachetools import LRUCache
 
 from sprung.model.identifier import Identifies, StageTimes
 from sprung.model.laws import Law
@@ -78,14 +79,13 @@ class _OwnIdentifiers:
 
     def __init__(self, catalogue: Sequence[Law]) -> None:
         self._catalogue = tuple(catalogue)
-        self._held: OrderedDict[str, Identifies] = OrderedDict()
+        self._held: LRUCache[str, Identifies] = LRUCache(KEPT)
 
     def ask(self, digest: str, file: SystemFile, what: str, *given: Any, **named: Any) -> tuple[Any, StageTimes]:
         """As `_asked`, of the identifier of a system file."""
-        identifier = self._held.pop(digest, None) or own_identifier(System(file, self._catalogue))
-        self._held[digest] = identifier
-        if len(self._held) > KEPT:
-            self._held.popitem(last=False)
+        identifier = self._held.get(digest)
+        if identifier is None:
+            identifier = self._held[digest] = own_identifier(System(file, self._catalogue))
         return _asked(identifier, what, *given, **named)
 
 

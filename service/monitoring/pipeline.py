@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
+from cachetools import LRUCache
 from sqlalchemy import Connection
 
 from sprung.model.signals import Estimate, FloatArray, MeasurementFault, Window
@@ -72,12 +72,11 @@ class Pipeline:
         self._beside = beside or compute
         self.pace = Pace()
         self._listeners = listeners
-        self._limit = vehicles_in_memory
         self._clock = clock
         self._follow = follow
         self._on_alarms = on_alarms
         self._shown = staging is None
-        self._vehicles: OrderedDict[str, HeldVehicle] = OrderedDict()
+        self._vehicles: LRUCache[str, HeldVehicle] = LRUCache(vehicles_in_memory)
         self._last_newcomer: Newcomer | None = None
         self._lock = threading.Lock()
         with store.write() as connection:
@@ -391,6 +390,3 @@ class Pipeline:
     def _remember(self, vehicle: str, at: HeldVehicle) -> None:
         with self._lock:
             self._vehicles[vehicle] = at
-            self._vehicles.move_to_end(vehicle)
-            while len(self._vehicles) > self._limit:
-                self._vehicles.popitem(last=False)
