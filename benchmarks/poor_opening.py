@@ -33,7 +33,7 @@ Answer = Callable[[Split, Tensor, Tensor], Predicted]  # windows of a split by t
 
 
 @dataclass(frozen=True)
-class _Data:
+class _OpeningTrial:
     config: TrainingConfig
     frames: FrameAutoencoder
     train: Split
@@ -79,17 +79,17 @@ def spoilt(task: Task, share: float, seed: int) -> Task:
     return replace(task, opening=opening)
 
 
-def _data(task: Task, settings: PaperSettings) -> _Data:
+def _data(task: Task, settings: PaperSettings) -> _OpeningTrial:
     """Data and embeddings as the task's own rows have them, from their checkpoints where these were made."""
     config = training_config(task.name, settings.budget, settings.seed)
     folder = settings.out / settings.budget / task.name / f"seed-{settings.seed}"
     folder.mkdir(parents=True, exist_ok=True)
     frames = train_frames(task, config, NetworkConfig(), folder, settings.clock, settings.device)
     train, test = (embedded(task, config, frames, name, folder, settings.device) for name in ("train", "test"))
-    return _Data(config, frames, train, test)
+    return _OpeningTrial(config, frames, train, test)
 
 
-def _trained(task: Task, data: _Data, settings: PaperSettings, name: str) -> Answer:
+def _trained(task: Task, data: _OpeningTrial, settings: PaperSettings, name: str) -> Answer:
     """ALPS that starts from the opening that `task` has."""
     folder = settings.folder / name
     folder.mkdir(exist_ok=True)
@@ -99,7 +99,7 @@ def _trained(task: Task, data: _Data, settings: PaperSettings, name: str) -> Ans
     return lambda split, rows, starts: evaluate.predict(model, split, rows, starts, lambda states: states)
 
 
-def _fitted(task: Task, data: _Data) -> Answer:
+def _fitted(task: Task, data: _OpeningTrial) -> Answer:
     """Output error that starts from the opening that `task` has."""
     reading = output_error.calibrated(task, data.train)
 
@@ -114,7 +114,7 @@ def _fitted(task: Task, data: _Data) -> Answer:
     return answer
 
 
-def _figures(task: Task, answer: Answer, data: _Data) -> dict[str, float]:
+def _figures(task: Task, answer: Answer, data: _OpeningTrial) -> dict[str, float]:
     """SE after an affine map fitted on training windows, and PE, on one window of every test trajectory."""
     rows = torch.arange(min(_GAUGE_WINDOWS, len(data.train.embeddings)))
     like = answer(data.train, rows, rows % (ROLLOUT - WINDOW + 1))

@@ -375,7 +375,7 @@ class VerdictRules:
     spread: float = rule(4.0, "standard deviations of a level; derived: one in 16 000 leaves them", 3.0, 6.0)
     parts: int = rule(2, "changes of the structure that are named; chosen: more of them imitate any other", 1, 3)
     parts_leave: float = rule(
-        0.02, "of the excess error, that two of them may leave; chosen: true ones leave less", 0.01, 0.05
+        0.02, "of the excess error, that one of them and values that are off may leave; chosen", 0.01, 0.05
     )
     slack: float = rule(1.5, "times a declared noise; chosen: a declaration is a round number", 1.2, 2.0)
 

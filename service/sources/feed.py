@@ -123,6 +123,7 @@ def feed_file(
         return fed.vehicle or vehicle_of(vehicle, recorded, file_name or path.name)
 
     priority = Priority.LIVE if speed else Priority.BATCH
+
     def refuse(piece: ReadWindows) -> None:
         other = _other_ride(pipeline, fed.vehicle, piece, recording_id)
         if other is not None:

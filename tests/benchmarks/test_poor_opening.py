@@ -38,7 +38,7 @@ def test_rows_name_system_share_and_method(tmp_path: Path, monkeypatch: pytest.M
     angle = rollouts.states[..., 0]
     seen = Split(rollouts, torch.stack([torch.sin(angle), torch.cos(angle)], dim=-1).float())
     config = training_config("pendulum", "quick", 0)
-    data = poor_opening._Data(config, None, seen, seen)  # type: ignore[arg-type]
+    data = poor_opening._OpeningTrial(config, None, seen, seen)  # type: ignore[arg-type]
     monkeypatch.setattr(poor_opening, "_data", lambda *_: data)
     monkeypatch.setattr(poor_opening, "SHARES", (0.0, 1.0))
     right, wrong = paper.run("poor_opening", method="output_error", out=tmp_path)

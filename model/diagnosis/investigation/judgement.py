@@ -125,19 +125,20 @@ def _out_of_order(state: Investigation) -> int:
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
     """Whether so many changes were found that they imitate another structure than the file's.
 
-    More structural ones than a few in any case, more than one if they leave a significant error (`errors`).  Masses and
-    instruments off beyond their tolerances count, too, where they are most of all, are beside more than one structural
-    change, or leave such an error.
+    More structural ones than a few in any case, more than one if they leave a significant error (`errors`): together
+    linear parts approximate any linear structure, and true ones would leave noise.  Masses and instruments off beyond
+    their tolerances count, too, where they are most of all, are beside more than one structural change, or leave much.
     """
     rules, parts = state.options.rules.verdict, changed_parts(state)
     if errors is None or parts > rules.parts:
         return parts > rules.parts
     off = _out_of_order(state)
     share = errors.explained(rules)
-    left = bool(np.any(errors.unexplained(rules) > 0)) and share is not None and share < 1 - rules.parts_leave
-    if (state.calibrations and 2 * off > state.calibrations) or (off > 0 and parts > 1):
+    left = bool(np.any(errors.unexplained(rules) > 0))
+    if (state.calibrations and 2 * off > state.calibrations) or (parts > 1 and (left or off > 0)):
         return True
-    return left and (parts > 1 or parts + off > rules.parts)
+    much = left and share is not None and share < 1 - rules.parts_leave
+    return much and parts + off > rules.parts
 
 
 def bounded(state: Investigation) -> Noise:
