@@ -441,6 +441,8 @@ class StructureLaw(Parametrised):
     strengths: tuple[int, ...] = ()  # parameters in which it is linear at first order, together 0 where it is absent
     # Derivative of its element's deflection that its force goes with, by its only parameter: 0, 1, 2; None: another way
     along: int | None = None
+    # What engineers quote of a structure that has it: name -> (value, unit)
+    quoted: Callable[[Mechanics], dict[str, tuple[float, str]]] | None = None
     holds: str = ""  # quantity of the element that the system file must hold: no candidate where that is estimated
     # What it puts beside every spring that its location names; the mechanics stay as they are
     branches: Callable[[Values, SpringDamper], tuple[Maxwell, ...]] | None = None

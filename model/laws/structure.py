@@ -202,6 +202,18 @@ def _damped_by_mode(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values
     return found
 
 
+def _frequencies_and_ratios(mechanics: Mechanics) -> dict[str, tuple[float, str]]:
+    """Of the elastic modes, with all dampers: zeta = phi^T C phi / (2 omega), for light damping."""
+    omegas, shapes = elastic_modes(mechanics)
+    along = mechanics.H @ shapes
+    ratios = mechanics.damping @ along**2 / (2 * omegas)
+    found = {}
+    for number, (omega, ratio) in enumerate(zip(omegas, ratios, strict=True), 1):
+        found[f"frequency_of_mode_{number}"] = (float(omega / (2 * np.pi)), "Hz")
+        found[f"damping_ratio_of_mode_{number}"] = (float(ratio), "1")
+    return found
+
+
 MODAL_DAMPING = StructureLaw(
     name="modal_damping",
     title="damping of the modes, not of dampers between the bodies",
@@ -215,6 +227,7 @@ MODAL_DAMPING = StructureLaw(
     looks_like="every resonance is damped on its own, as no set of dampers between the bodies would damp them",
     confused_with=("structural_damping", "missing_connection"),
     sentence="damped mode by mode, by {all} of critical damping beside the dampers between them",
+    quoted=_frequencies_and_ratios,
     strengths=tuple(range(MOST_MODES)),
     prior_cost=RARE,
 )

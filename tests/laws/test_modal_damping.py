@@ -46,6 +46,17 @@ def test_every_mode_has_its_ratio_and_keeps_its_frequency() -> None:
     np.testing.assert_allclose(-values.real / np.abs(values), RATIOS, rtol=1e-9)
 
 
+def test_quoted_are_frequencies_and_ratios_with_all_dampers() -> None:
+    """Against the eigenvalues, with dampers between the storeys of up to 2 % beside the ratios."""
+    text = BUILDING.replace("damping: {value: 0.0, fixed: true}", "damping: 2.0e+3")
+    found = damped(parse_system(text).mechanics, text)
+    assert MODAL_DAMPING.quoted is not None
+    quoted = MODAL_DAMPING.quoted(found)
+    for number, mode in enumerate(found.modes(("first", "second", "roof")), 1):
+        assert quoted[f"frequency_of_mode_{number}"][0] == pytest.approx(mode.frequency, rel=1e-3)
+        assert quoted[f"damping_ratio_of_mode_{number}"][0] == pytest.approx(mode.damping_ratio, rel=1e-2)
+
+
 def test_bodies_on_a_single_support_are_damped_relative_to_it() -> None:
     mechanics = parse_system(BUILDING).mechanics
     found = damped(mechanics)

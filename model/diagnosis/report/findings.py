@@ -13,7 +13,7 @@ from sprung.model.diagnosis.investigation.verdict import kind_of
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of
-from sprung.model.diagnosis.report.values import formula_of, input_fault_parameter, law_parameters
+from sprung.model.diagnosis.report.values import formula_of, input_fault_parameter, law_parameters, quoted_values
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ReportRules
 from sprung.model.laws.basis import UNKNOWN
@@ -85,6 +85,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
             family=family,
             elsewhere=_elsewhere(found, state.options.rules.report),
             advice=advice,
+            quoted=quoted_values(outcome.final, state.given + index),
             look_alikes=_beaten(found),
             formula=formula_of(term)[0],
             memory=formula_of(term)[1],

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.state import InputFault
 from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
+from sprung.model.diagnosis.response.forward import mechanics_of
 from sprung.model.diagnosis.response.harmonic_balance import LawForces
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, PlausibleRules
-from sprung.model.laws import ElementLaw, reversal_step
+from sprung.model.laws import ElementLaw, StructureLaw, reversal_step
 from sprung.model.laws.base import ParameterSpec
 from sprung.model.laws.sensor_faults import OF_CHANNEL
 from sprung.model.signals import FloatArray
@@ -97,6 +99,34 @@ def law_parameters(fit: Fit, index: int, rules: PlausibleRules = RULES.plausible
         LawParameter(spec.name, float(value), float(s), _unit_at(fit.forward.system, term.location, spec))
         for spec, value, s in zip(term.law.parameters, term.parameters, sigma, strict=True)
         if not hidden
+    )
+
+
+_STEP = 1e-3  # of a deviation, in which a quoted value moves for its slope
+
+
+def quoted_values(fit: Fit, index: int) -> tuple[LawParameter, ...]:
+    """What engineers quote of a structure with a law; deviations by linear propagation of the fit's covariance."""
+    law, system, point = fit.point.terms[index].law, fit.forward.system, fit.point
+    if not isinstance(law, StructureLaw) or (quote := law.quoted) is None:
+        return ()
+
+    def quoted(moved: FloatArray) -> FloatArray:
+        terms = list(point.terms)
+        for i, term in enumerate(terms):
+            terms[i] = replace(term, parameters=tuple(np.add(term.parameters, moved[fit.place(i)])))
+        found = quote(mechanics_of(system, point.theta + moved[: len(point.theta)], tuple(terms)))
+        return np.array([value for value, _ in found.values()])
+
+    steps = _STEP * np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
+    free, base = np.flatnonzero(steps), quoted(np.zeros(len(steps)))
+    slopes = np.zeros((len(base), len(free)))
+    for column, i in enumerate(free):
+        slopes[:, column] = (quoted(np.where(np.arange(len(steps)) == i, steps, 0.0)) - base) / steps[i]
+    sigma = np.sqrt(np.einsum("ij,jk,ik->i", slopes, fit.covariance[np.ix_(free, free)], slopes))
+    named = quote(mechanics_of(system, point.theta, point.terms)).items()
+    return tuple(
+        LawParameter(name, value, float(s), unit) for (name, (value, unit)), s in zip(named, sigma, strict=True)
     )
 
 

@@ -21,13 +21,13 @@ from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branches_of, evaluated_in_time, supports
 from sprung.model.laws import CLOCK_LEAD, SensorLaw, SensorResponse, SpringDamper, SupportLaw
 from sprung.model.laws.in_place import with_law
-from sprung.model.mechanics import VELOCITY
+from sprung.model.mechanics import VELOCITY, Mechanics
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 
-def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Structure:
-    """Structure for log-ratios `theta` (P,) of the system's parameters, with laws of bodies and structure."""
+def mechanics_of(system: System, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Mechanics:
+    """Mechanics for log-ratios `theta` (P,) of the system's parameters, with laws of bodies and structure."""
     mechanics = system.mechanics
     mass, stiffness, damping = mechanics.mass.copy(), mechanics.stiffness.copy(), mechanics.damping.copy()
     for parameter, log_ratio in zip(system.parameters, theta, strict=True):
@@ -41,7 +41,12 @@ def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: 
     for term in terms:
         if term.law.load is None:  # else its force is added to the response
             mechanics = with_law(system.file, mechanics, term.law, term.location, term.parameters, term.variant)
-    return Structure.nominal(mechanics, sensors)
+    return mechanics
+
+
+def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Structure:
+    """The same with the sensors `sensors` (S,)."""
+    return Structure.nominal(mechanics_of(system, theta, terms), sensors)
 
 
 @dataclass(frozen=True)

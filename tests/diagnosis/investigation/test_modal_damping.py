@@ -57,7 +57,11 @@ def test_modes_that_are_damped_on_their_own_are_named_with_their_ratios() -> Non
     (finding,) = report.findings
     assert (finding.location, finding.effect) == ("first|second|roof", "modal_damping")
     assert [parameter.name for parameter in finding.parameters] == ["mode_1", "mode_2", "mode_3"]
-    # what the dampers keep is part of every mode's damping
+    # what the dampers keep is part of every mode's damping, and is quoted with it
+    quoted = {q.name: q for q in finding.quoted}
+    ratios = [quoted[f"damping_ratio_of_mode_{n}"] for n in (1, 2, 3)]
+    assert all(abs(q.value - true) < 3 * q.std + 1e-5 for q, true in zip(ratios, RATIOS, strict=True))
+    assert all(q.std < 0.1 * q.value for q in ratios)
     written = parse_system(improved_text(BUILDING, system, report))
     assert left_out(report) == []
     modes = written.whole_system.mechanics.modes(written.bodies)
