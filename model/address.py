@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, date, datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
 from sprung.model.signals import TimeColumn
 from sprung.model.units import FACTORS, known, to_si
@@ -45,6 +45,17 @@ def _as_text(raw: Any) -> Any:
 Column = Annotated[str, BeforeValidator(_as_text, json_schema_input_type=str | int), Field(min_length=1)]
 
 
+LARGEST = 1e30  # of any value of a system file, SI; beyond it products overflow
+SMALLEST = 1 / LARGEST
+
+
+def zero_or_seen(value: float) -> float:
+    """A value that is 0 or large enough to be calculated with."""
+    if 0.0 < value < SMALLEST:
+        raise ValueError(f"must be 0, or at least {SMALLEST:g}")
+    return value
+
+
 class Address(Strict):
     """Where recordings keep one signal, what their numbers mean, and the standard deviation of one sample.
 
@@ -59,7 +70,9 @@ class Address(Strict):
     offset: float = Field(default=0.0, description="added after the scale, in `unit`")
     sign: Literal[1, -1] = Field(default=1, description="-1 where the recording counts the other way")
     unit: str | None = Field(default=None, description="of the scaled number; default SI")
-    noise: float = Field(default=0.0, ge=0, description="standard deviation of one sample, SI")
+    noise: Annotated[float, AfterValidator(zero_or_seen)] = Field(
+        default=0.0, ge=0, le=LARGEST, description="standard deviation of one sample, SI"
+    )
     laws: Laws = ()
     range: tuple[float, float] | None = Field(
         default=None, description="[lowest, highest] possible value, SI; others are taken as missing"

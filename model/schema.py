@@ -11,9 +11,9 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, model_validator
 
-from sprung.model.address import Address, Laws, Strict, TimeKey
+from sprung.model.address import LARGEST, SMALLEST, Address, Laws, Strict, TimeKey, zero_or_seen
 from sprung.model.sensor_kinds import KINDS, ElementKind, MotionKind
 from sprung.model.units import FACTORS, UnitError, known
 
@@ -29,7 +29,7 @@ class SystemFileError(ValueError):
 class Value(Strict):
     """A physical value; `fixed` ones are never estimated."""
 
-    value: float = Field(ge=0)
+    value: Annotated[float, AfterValidator(zero_or_seen)] = Field(ge=0, le=LARGEST)
     fixed: bool = False
 
 
@@ -47,6 +47,7 @@ class MassValue(Value):
 
 
 Mass = Annotated[MassValue, BeforeValidator(_as_value, json_schema_input_type=float | MassValue)]
+MOST_BODIES = 200  # the time to check that sensors see every mode goes with the fourth power
 Point = tuple[float, float]
 GROUND = "ground"  # the fixed support, of every system
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
@@ -74,8 +75,8 @@ class Body(Strict):
     """A rigid body: heaves; with inertias it also rolls and pitches about `position`."""
 
     mass: Mass  # kg
-    roll_inertia: float | None = Field(default=None, gt=0)  # kg m^2
-    pitch_inertia: float | None = Field(default=None, gt=0)  # kg m^2
+    roll_inertia: float | None = Field(default=None, ge=SMALLEST, le=LARGEST)  # kg m^2
+    pitch_inertia: float | None = Field(default=None, ge=SMALLEST, le=LARGEST)  # kg m^2
     position: Point = (0.0, 0.0)  # m
     laws: Laws = ()
     load: Annotated[Load | None, BeforeValidator(_as_load, json_schema_input_type=bool | Load | None)] = None
@@ -179,15 +180,15 @@ class SystemFile(Strict):
     """The contents of a system file, with checked references between its parts."""
 
     name: Annotated[str, Field(min_length=1, max_length=200), StringConstraints(strip_whitespace=True)]
-    sample_rate: float = Field(gt=0)  # Hz
-    window: int = Field(ge=8)  # samples, the paper's tau
+    sample_rate: float = Field(gt=0, le=1e6)  # Hz
+    window: int = Field(ge=8, le=10_000)  # samples, the paper's tau
     hop: int | None = Field(default=None, ge=1)  # samples between window starts; default half a window
     time: TimeKey = TimeKey()
     speed: Annotated[Speed | None, BeforeValidator(_as_value, json_schema_input_type=float | Speed | None)] = None
     temperature: Address | None = Field(default=None, description="of the air, or of the bogie: degC, K or degF")
     yaw_rate: Address | None = Field(default=None, description="of the car or a bogie, rad/s: curves")
     lateral_acceleration: Address | None = Field(default=None, description="of the car or a bogie: curves")
-    bodies: dict[Name, Body] = Field(default_factory=dict)
+    bodies: dict[Name, Body] = Field(default_factory=dict, max_length=MOST_BODIES)
     inputs: dict[Name, Input] = Field(default_factory=dict)
     elements: dict[Name, Element] = Field(default_factory=dict)
     sensors: dict[Name, Sensor] = Field(min_length=1)

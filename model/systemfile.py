@@ -28,6 +28,7 @@ _PATTERNS = {
 }
 MOST_PROBLEMS = 20  # that are listed
 DEEPEST = 50  # brackets or indents inside each other; a system file has six
+LONGEST_SHOWN = 100  # characters of a value that is wrong
 MOST_BYTES = 2_000_000  # a system file has 10 kB
 MOST_NODES = 20_000  # names and values, with those that aliases repeat; a vehicle has 600
 TOO_MANY = f"more than {MOST_NODES} names and values, with those that aliases repeat"
@@ -220,11 +221,18 @@ def _explain(detail: ErrorDetails, node: yaml.Node | None) -> tuple[int, str]:
     return _line_of(node, keys), f"{'.'.join(keys)}: {_words(detail, keys)}"
 
 
+def shortened(text: str) -> str:
+    """The beginning of what is too long for a line."""
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]} ..."
+
+
 def _words(detail: ErrorDetails, keys: list[str]) -> str:
     """What is wrong, in plain words."""
     given, limits = detail["input"], detail.get("ctx", {})
-    value = f", not {given!r}" if isinstance(given, (str, int, float)) else ""
+    value = f", not {shortened(repr(given))}" if isinstance(given, (str, int, float)) else ""
     match detail["type"]:
+        case "too_long" if "field_type" in limits and limits["field_type"] == "Dictionary":
+            return f"at most {limits['max_length']} are possible"
         case "missing":
             return "this key is missing"
         case "extra_forbidden":

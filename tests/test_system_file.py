@@ -216,6 +216,32 @@ estimate: [stiffness, colour]
 """
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("mass: 300.0", "mass: 1e300", "bodies.sprung.mass: must be less than or equal to 1e+30, not 1e+300"),
+        ("mass: 300.0", "mass: 1e-300", "bodies.sprung.mass: must be 0, or at least 1e-30"),
+        ("stiffness: 2.0e4", "stiffness: 1e300", "elements.strut.stiffness: must be less than or equal to 1e+30"),
+        ("noise: 1e-5", "noise: 1e-300", "inputs.road.displacement.noise: must be 0, or at least 1e-30"),
+        ("window: 200", "window: 1000000000", "window: must be less than or equal to 10000"),
+        ("sample_rate: 200", "sample_rate: 1e9", "sample_rate: must be less than or equal to 1e+06"),
+        (
+            "bodies:\n",
+            "bodies:\n" + "".join(f"  b{i}: {{mass: 1}}\n" for i in range(300)),
+            "bodies: at most 200 are possible",
+        ),
+    ],
+)
+def test_values_that_cannot_be_calculated_with_are_refused(old: str, new: str, message: str) -> None:
+    assert old in QUARTER_CAR
+    assert any(message in line for line in problems(QUARTER_CAR.replace(old, new, 1)))
+
+
+def test_a_value_of_many_characters_is_not_repeated_whole() -> None:
+    (line,) = problems(QUARTER_CAR.replace("sample_rate: 200", f"sample_rate: {'fast' * 10_000}"))
+    assert "a number is expected, not 'fastfast" in line and len(line) < 200
+
+
 def test_everything_that_is_wrong_is_reported_at_once_in_plain_words(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -43,9 +43,19 @@ class PlainLines(logging.Formatter):
         return escaped(line)  # a terminal would obey them
 
 
+TOLD = "sprung_told"  # attribute of an exception that is in the log already
+
+
+def untold(record: logging.LogRecord) -> bool:
+    """Whether an exception is not in the log yet: the server reports what the application has reported."""
+    error = record.exc_info[1] if record.exc_info else None
+    return not getattr(error, TOLD, False)
+
+
 def set_up(form: str, level: str) -> None:
     """Log to stderr; form: text or json."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines() if form == "json" else PlainLines())
+    handler.addFilter(untold)
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("sprung").setLevel(level.upper())

@@ -18,7 +18,7 @@ from sprung.model.system import System
 from sprung.service.access.notice import access_notice, is_loopback
 from sprung.service.access.tokens import Refused, Tokens
 from sprung.service.api.guard import COOKIE, Limiter
-from sprung.service.api.problems import ApiProblem
+from sprung.service.api.problems import ApiProblem, _as_problem
 from sprung.service.api.scopes import NEEDS, need_of
 from sprung.service.app import create_app
 from sprung.service.cli import main
@@ -27,7 +27,7 @@ from sprung.service.errors import NotFound, UserError
 from sprung.service.fleet.message import MEDIA_TYPE, Message, WindowEstimate, encode
 from sprung.service.main import Feeds, serve
 from sprung.service.monitoring.engine import Engine
-from sprung.service.observability.logs import JsonLines, PlainLines, request_id
+from sprung.service.observability.logs import JsonLines, PlainLines, request_id, untold
 from sprung.service.settings import Settings
 from sprung.service.store import Store, audit, open_store, tokens
 from tests.service_fakes import make_window
@@ -485,6 +485,15 @@ def test_logs_are_one_json_object_a_line_with_the_request() -> None:
     finally:
         request_id.reset(token)
     assert (line["event"], line["level"], line["job"], line["request"]) == ("job ended", "info", "j1", "ride-7")
+
+
+def test_an_unexpected_error_is_in_the_log_once() -> None:
+    """The server reports again what the application has reported."""
+    error = RuntimeError("x")
+    again = logging.makeLogRecord({"name": "uvicorn.error", "msg": "x", "exc_info": (RuntimeError, error, None)})
+    assert untold(again)
+    assert _as_problem(error).status == 500
+    assert not untold(again)
 
 
 def test_a_message_of_several_lines_is_one_line_for_people() -> None:
