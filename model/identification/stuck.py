@@ -42,7 +42,10 @@ class StuckChannels:
         return tuple(found)
 
     def noisy(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
-        """Those of one window (T, C) that alone of their unit show more noise than the file states."""
+        """Those of one window (T, C) that alone of their unit show more noise than the file states.
+
+        Not those that have no other of their unit beside them: friction and stops reach as high as noise does.
+        """
         taper = np.hanning(len(window) + 2)[1:-1]
         spectrum = np.fft.rfft((window - window.mean(axis=0)) * taper[:, None], axis=0)
         high = np.abs(spectrum[round(_ABOVE * len(spectrum)) :]) ** 2
@@ -51,7 +54,7 @@ class StuckChannels:
         found = []
         for c in np.flatnonzero(ratio > _NOISY).tolist():
             others = (self.units == self.units[c]) & np.isfinite(ratio) & (np.arange(len(ratio)) != c)
-            if not others.any() or ratio[c] > _NOISY * np.median(ratio[others]):
+            if others.any() and ratio[c] > _NOISY * np.median(ratio[others]):
                 found.append(MeasurementFault(self.names[c], "noisy", float(f"{std[c]:.2g}")))
         return tuple(found)
 
