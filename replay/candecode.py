@@ -31,6 +31,8 @@ INVALID_CHOICE = re.compile(
     re.IGNORECASE,
 )
 MOST_BYTES, FLOAT_BITS = 64, (16, 32, 64)  # of a frame of CAN FD; of a field in IEEE 754
+MOST_TRANSPORTED = 1785  # bytes of a message in several frames (SAE J1939-21), which a database may describe, too
+PLACE = re.compile(rb"\bSG_\s+(\w+)[^:\n]*:\s*(\d+)\|(\d+)@")  # of a signal in a DBC: name, first bit, bits
 ALL_ONES_BITS = 8  # a narrower field of all ones is an ordinary value
 
 
@@ -262,15 +264,32 @@ def _count_missing(
 def load_database(path: Path) -> Database:
     """A cantools database (DBC, KCD, SYM, ARXML); raises UnreadableRecording with one line."""
     try:
+        _no_giant(path)
         database = cantools.database.load_file(path, strict=False)
     except FileNotFoundError:
         raise UnreadableRecording(f"{path}: no such CAN database") from None
+    except UnreadableRecording:
+        raise
     except Exception as error:
         line = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UnreadableRecording(f"{path}: not a CAN database that can be read: {line}") from error
     if not isinstance(database, Database):
         raise UnreadableRecording(f"{path}: a diagnostics database, not one of CAN messages")
     return database
+
+
+def _no_giant(path: Path) -> None:
+    """Refuse a DBC with a signal of which cantools would draw a billion bits."""
+    if path.suffix.lower() != ".dbc":
+        return
+    for name, start, length in PLACE.findall(path.read_bytes()):
+        if int(start) + int(length) > 8 * MOST_TRANSPORTED:
+            raise _unheld(name.decode(), int(start), int(length))
+
+
+def _unheld(name: str, start: int, length: int) -> UnreadableRecording:
+    what = f"{length} bits from bit {start} on"
+    return UnreadableRecording(f"signal {name} of the CAN database: {what}, which no frame holds so")
 
 
 def _plan(channels: Sequence[Channel], database: Database) -> list[MessagePlan]:
@@ -355,8 +374,7 @@ def _bits(signal: Signal) -> Bits:
     bits = Bits(signal.start, signal.length, signal.byte_order == "big_endian")
     lengths = FLOAT_BITS if signal.conversion.is_float else range(1, 65)
     if signal.length not in lengths or signal.start < 0 or bits.end > MOST_BYTES:
-        what = f"{signal.length} bits from bit {signal.start} on"
-        raise UnreadableRecording(f"signal {signal.name} of the CAN database: {what}, which no frame holds so")
+        raise _unheld(signal.name, signal.start, signal.length)
     return bits
 
 

@@ -32,9 +32,10 @@ def test_a_share_of_the_opening_is_random_and_the_seed_says_which() -> None:
     torch.testing.assert_close(opened(0.5, 1), 0.5 * right + 0.5 * opened(1, 1))
 
 
+@pytest.mark.slow
 def test_rows_name_system_share_and_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = pendulum.TASK
-    rollouts = task.sample(12, np.random.default_rng(0), task.seen)
+    rollouts = task.sample(4, np.random.default_rng(0), task.seen)
     angle = rollouts.states[..., 0]
     seen = Split(rollouts, torch.stack([torch.sin(angle), torch.cos(angle)], dim=-1).float())
     config = training_config("pendulum", "quick", 0)
