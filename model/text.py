@@ -8,6 +8,7 @@ import re
 # zero-width ones, marks and changes of direction, separators of lines and paragraphs, the soft hyphen
 UNSEEN = r"\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
 CONTROL = r"\x00-\x1f\x7f-\x9f"
+IN_VEHICLE_IDS = "A-Za-z0-9._:-"
 _HIDDEN = re.compile(f"[{CONTROL}{UNSEEN}\U000e0000-\U000e007f]")  # tags, too
 
 

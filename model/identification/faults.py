@@ -148,8 +148,10 @@ class Explainer:
     def _shown(self, window: FloatArray, *, noisy: bool) -> tuple[MeasurementFault, ...]:
         """What the samples of a window (T, C) show by themselves; noisy: noise, too."""
         stuck = self.stuck.channels(window)
+        if not noisy:
+            return stuck
         names = {fault.channel for fault in stuck}
-        return stuck + tuple(f for f in self.stuck.noisy(window) if noisy and f.channel not in names)
+        return stuck + tuple(f for f in self.stuck.noisy(window) if f.channel not in names)
 
     def _can_lose(self, columns: IntArray) -> bool:
         """Whether windows can be refined without these channels."""

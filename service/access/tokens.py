@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from cachetools import TTLCache
 
-from sprung.model.text import CONTROL, UNSEEN
+from sprung.model.text import IN_VEHICLE_IDS, hidden_character
 from sprung.service.errors import NotFound, UserError
 from sprung.service.store import Store, audit, tokens
 from sprung.service.store.tokens import TokenRow
@@ -28,7 +28,7 @@ from sprung.service.times import NANOSECONDS, now_ns
 SCOPES = ("read", "ingest", "operate", "admin")
 IMPLIED = {"admin": {"read", "ingest", "operate", "admin"}, "operate": {"operate", "read"}}
 PREFIX = "sprung"
-FLEET = re.compile(r"([A-Za-z0-9][A-Za-z0-9._:-]*)?")  # how a vehicle's id may begin; empty: all
+FLEET = re.compile(f"([A-Za-z0-9][{IN_VEHICLE_IDS}]*)?")  # how a vehicle's id may begin; empty: all
 REMEMBER_SECONDS = 5.0  # for which a token that was revoked may still be taken
 MOST_REMEMBERED = 1000
 SESSION_SECONDS = 12 * 3600.0
@@ -88,7 +88,7 @@ class Tokens:
             raise UserError(f"scope {', '.join(unknown) or 'is missing'}: known are {', '.join(SCOPES)}")
         if not name or len(name) > 128 or len(fleet) > 128:
             raise UserError("a token needs a name, and name and fleet have at most 128 characters")
-        if re.search(f"[{CONTROL}{UNSEEN}]", name):
+        if hidden_character(name):
             raise UserError(f"a token's name cannot hold control characters: {name!r}")
         if not FLEET.fullmatch(fleet):
             raise UserError(f"no vehicle's id can begin with {fleet!r}: letters, digits and . _ : - only")

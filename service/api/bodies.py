@@ -12,14 +12,14 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import PydanticCustomError, from_json
 
 from sprung.model.signals import FloatArray
-from sprung.model.text import CONTROL, UNSEEN
+from sprung.model.text import CONTROL, IN_VEHICLE_IDS, UNSEEN
 from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
 from sprung.service.api.twice import keys_twice
 from sprung.service.fleet.message import SentWindows
 from sprung.service.monitoring.form import WindowForm
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
-VEHICLE_ID = re.compile(r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")
+VEHICLE_ID = re.compile(rf"^[A-Za-z0-9][{IN_VEHICLE_IDS}]{{0,127}}$")
 
 
 def _vehicle_id(text: str) -> str:

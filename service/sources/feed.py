@@ -13,6 +13,7 @@ from typing import Any
 
 from sprung.model import comfort
 from sprung.model.signals import Tally
+from sprung.model.text import IN_VEHICLE_IDS
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.errors import UserError
 from sprung.service.monitoring import rides
@@ -26,7 +27,7 @@ from sprung.service.times import AHEAD, now_ns, to_iso
 
 MOST_MINUTES = 1440  # of comfort that a summary keeps
 MOST_LOST = 0.1  # of the samples; with more, too few windows can be used
-NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._:-]")
+NOT_IN_IDS = re.compile(f"[^{IN_VEHICLE_IDS}]")
 
 OnBatch = Callable[[Batch], None]
 OnTally = Callable[[Tally], None]

@@ -112,21 +112,22 @@ def quoted_values(fit: Fit, index: int) -> tuple[LawParameter, ...]:
         return ()
 
     def quoted(moved: FloatArray) -> FloatArray:
-        terms = list(point.terms)
-        for i, term in enumerate(terms):
-            terms[i] = replace(term, parameters=tuple(np.add(term.parameters, moved[fit.place(i)])))
-        found = quote(mechanics_of(system, point.theta + moved[: len(point.theta)], tuple(terms)))
+        terms = tuple(
+            replace(term, parameters=tuple(np.add(term.parameters, moved[fit.place(i)])))
+            for i, term in enumerate(point.terms)
+        )
+        found = quote(mechanics_of(system, point.theta + moved[: len(point.theta)], terms))
         return np.array([value for value, _ in found.values()])
 
-    steps = _STEP * np.sqrt(np.maximum(np.diag(fit.covariance), 0.0))
-    free, base = np.flatnonzero(steps), quoted(np.zeros(len(steps)))
-    slopes = np.zeros((len(base), len(free)))
-    for column, i in enumerate(free):
-        slopes[:, column] = (quoted(np.where(np.arange(len(steps)) == i, steps, 0.0)) - base) / steps[i]
-    sigma = np.sqrt(np.einsum("ij,jk,ik->i", slopes, fit.covariance[np.ix_(free, free)], slopes))
-    named = quote(mechanics_of(system, point.theta, point.terms)).items()
+    stated = quote(mechanics_of(system, point.theta, point.terms))
+    base = np.array([value for value, _ in stated.values()])
+    moves = np.diag(_STEP * np.sqrt(np.maximum(np.diag(fit.covariance), 0.0)))
+    free = np.flatnonzero(np.diag(moves))
+    slopes = np.array([(quoted(moves[i]) - base) / moves[i, i] for i in free]).reshape(len(free), len(base))
+    sigma = np.sqrt(np.einsum("ji,jk,ki->i", slopes, fit.covariance[np.ix_(free, free)], slopes))
     return tuple(
-        LawParameter(name, value, float(s), unit) for (name, (value, unit)), s in zip(named, sigma, strict=True)
+        LawParameter(name, value, float(std), unit)
+        for (name, (value, unit)), std in zip(stated.items(), sigma, strict=True)
     )
 
 
