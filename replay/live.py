@@ -159,7 +159,7 @@ class LiveBus:
         return message
 
     def _opened(self, bus: can.BusABC) -> None:
-        self.connected, self.trouble = True, ""
+        self._note_connected()
         self._offset, self._behind, self.lag = math.inf, False, 0.0
         self._lost_before = lost_by_kernel(bus, self.address)
         if not self._told:
@@ -187,11 +187,10 @@ class LiveBus:
         for message in messages:
             off = message.is_error_frame and bool(message.arbitration_id & ERROR_BUS_OFF)
             if off and self.connected:
-                self.connected, self.trouble = False, BUS_OFF
-                self.account.problem(f"bus {self.name} lost: {BUS_OFF}")
+                self._note_trouble(BUS_OFF)
             on = not message.is_error_frame or bool(message.arbitration_id & ERROR_RESTARTED)
             if on and not off and not self.connected:
-                self.connected, self.trouble = True, ""
+                self._note_connected()
 
     def _wanted(self, messages: list[can.Message]) -> list[can.Message]:
         """Without frames of other ids: on a busy bus most are, and looking closer costs more than they are worth."""
@@ -218,10 +217,19 @@ class LiveBus:
         return messages
 
     def _note_loss(self, error: Exception, retry: float) -> None:
-        self.connected = False
         self.reconnects += 1
-        self.trouble = str(error).splitlines()[0] if str(error) else type(error).__name__
-        self.account.problem(f"bus {self.name} lost: {self.trouble}; trying again in {retry:.1f} s")
+        trouble = str(error).splitlines()[0] if str(error) else type(error).__name__
+        self._note_trouble(trouble, f"; trying again in {retry:.1f} s")
+
+    def _note_trouble(self, trouble: str, next_step: str = "") -> None:
+        """`connected` last, here and below: whoever reads it in another thread finds the reason already there."""
+        self.account.problem(f"bus {self.name} lost: {trouble}{next_step}")
+        self.trouble = trouble
+        self.connected = False
+
+    def _note_connected(self) -> None:
+        self.trouble = ""
+        self.connected = True
 
 
 def frame_block(messages: Sequence[can.Message], account: Account) -> FrameBlock:
