@@ -123,11 +123,17 @@ class Client:
         """Identify one window; its form is that of `POST /identify`."""
         return self._post("/identify", models.IdentifyAnswer, window, query)
 
-    def upload(self, path: Path, vehicle: str | None = None, diagnose: bool = False) -> job_models.Job:
-        """Send a recording to be followed, or to be diagnosed; `wait` for the job."""
+    def upload(
+        self, path: Path, vehicle: str | None = None, diagnose: bool = False, start: str | None = None
+    ) -> job_models.Job:
+        """Send a recording to be followed, or to be diagnosed; `wait` for the job.
+
+        start: when it began (RFC 3339), where its times count from 0.
+        """
         boundary = uuid.uuid4().hex
         kind = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
-        parts = [_field(boundary, "vehicle", vehicle)] if vehicle is not None else []
+        said = {"vehicle": vehicle, "start": start}
+        parts = [_field(boundary, name, value) for name, value in said.items() if value is not None]
         head = f'--{boundary}\r\nContent-Disposition: form-data; name="file"; filename="{path.name}"\r\n'
         parts += [f"{head}Content-Type: {kind}\r\n\r\n".encode(), path.read_bytes(), b"\r\n"]
         body = b"".join([*parts, f"--{boundary}--\r\n".encode()])

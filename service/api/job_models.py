@@ -57,6 +57,7 @@ class RecordingAnswer(BaseModel):
     source: str
     size_bytes: int | None
     kept: bool = Field(description="the file is still there and can be diagnosed")
+    start: str | None = Field(description="when it began, as its sender has said; used where its times count from 0")
     created: str
     finished: str | None
     tally: dict[str, Any] | None

@@ -160,6 +160,7 @@ def recording_dict(row: Any) -> dict[str, Any]:
         "source": row.source,
         "size_bytes": row.size_bytes,
         "kept": row.file is not None,
+        "start": optional_iso(row.began_ns),
         "created": to_iso(row.created_ns),
         "finished": optional_iso(row.finished_ns),
         "tally": row.tally,

@@ -34,8 +34,9 @@ async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -
     """Replays the recording (MCAP, BLF, ASC, candump log, MF4, CSV and others) into the store as a job; the answer says
     where to ask for it.
 
-    `vehicle` names whose it is; without it the recording's own metadata or the file's name does.  A file that was
-    sent before is not kept twice: while its job waits or runs, that job is the answer.
+    `vehicle` names whose it is; without it the recording's own metadata or the file's name does.  `start` says when
+    it began, where its times count from 0.  A file that was sent before is not kept twice: while its job waits or
+    runs, that job is the answer.
     """
 
     async def act() -> Response:

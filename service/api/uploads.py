@@ -28,7 +28,7 @@ from sprung.service.durable import sync_folder
 from sprung.service.settings import Settings
 from sprung.service.store import Store, work
 from sprung.service.store.work import RecordingRow
-from sprung.service.times import now_ns
+from sprung.service.times import AHEAD, from_iso, now_ns
 from sprung.service.upload_room import Share
 
 CHUNK = 1 << 20
@@ -48,6 +48,11 @@ BODY: dict[str, Any] = {
                 "properties": {
                     "file": {"type": "string", "format": "binary", "description": "its name says its kind"},
                     "vehicle": {"type": "string", "description": "whose it is; else as recorded, else the file's name"},
+                    "start": {
+                        "type": "string",
+                        "description": "when it began (RFC 3339, or seconds since the epoch) where its times count "
+                        "from 0; else it is taken to begin when it was received",
+                    },
                 },
             }
         }
@@ -57,11 +62,11 @@ BODY: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Upload:
-    """A file that was received whole, and the form's vehicle."""
+    """A file that was received whole, with what the form says of it: its vehicle, and in the row when it began."""
 
     row: RecordingRow
     vehicle: str | None
-    identity: str  # of a form: the file's content and name, and the vehicle
+    identity: str  # of a form: the file's content and name, the vehicle and the start
     fresh: bool = True  # False: it was sent before and is still kept; the row is that one's
 
 
@@ -176,12 +181,7 @@ class Form:
             raise ApiProblem(422, "file is missing", [{"field": "file", "detail": "is missing"}])
         if not self._ended:
             raise ApiProblem(422, "the body ends within the form")
-        vehicle = None
-        if "vehicle" in self._values:
-            try:
-                vehicle = _VEHICLE.validate_python(self._values["vehicle"].decode("utf-8", "replace"))
-            except ValidationError as error:
-                raise from_validation(error, "vehicle.") from None
+        vehicle, began = self._vehicle(), self._start()
         digest = self._digest.hexdigest()
         stored = work.upload_name(digest, self._id, self._extension)
         if self._share is not None:
@@ -190,8 +190,8 @@ class Form:
             self._target.close()
             (self._uploads / self._part_file).replace(self._uploads / stored)
             sync_folder(self._uploads)
-        row = RecordingRow(self._id, None, self._label, "upload", stored, self.size, None, now_ns(), None)
-        return Upload(row, vehicle, json.dumps([digest, self._label, vehicle]))
+        row = RecordingRow(self._id, None, self._label, "upload", stored, self.size, None, now_ns(), None, began)
+        return Upload(row, vehicle, json.dumps([digest, self._label, vehicle, began]))
 
     def close(self) -> None:
         """Delete an unfinished upload."""
@@ -199,6 +199,28 @@ class Form:
             self._target.close()
         if self._part_file:
             (self._uploads / self._part_file).unlink(missing_ok=True)
+
+    def _vehicle(self) -> str | None:
+        """Whose it is, as the form says."""
+        if "vehicle" not in self._values:
+            return None
+        try:
+            return _VEHICLE.validate_python(self._values["vehicle"].decode("utf-8", "replace"))
+        except ValidationError as error:
+            raise from_validation(error, "vehicle.") from None
+
+    def _start(self) -> int | None:
+        """When the recording began, ns since 1970, as the form says."""
+        text = self._values.get("start", bytearray()).decode("utf-8", "replace")
+        if not text:
+            return None
+        try:
+            began = from_iso(text)
+        except (ValueError, OverflowError):
+            raise _wrong_start("is no time such as 2026-09-21T14:13:20Z") from None
+        if not 0 <= began <= now_ns() + AHEAD:
+            raise _wrong_start("is before 1970 or in the future")
+        return began
 
     def _begin_part(self) -> None:
         self._parts += 1
@@ -248,6 +270,10 @@ class Form:
 
     def _end(self) -> None:
         self._ended = True
+
+
+def _wrong_start(detail: str) -> ApiProblem:
+    return ApiProblem(422, f"start {detail}", [{"field": "start", "detail": detail}])
 
 
 def known_extension(label: str) -> str:

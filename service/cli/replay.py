@@ -95,7 +95,7 @@ def _replay(pipeline: Pipeline, settings: Settings, options: ReplayOptions, name
 
 def _fed(pipeline: Pipeline, settings: Settings, options: ReplayOptions, path: Path, start: int | None) -> FeedResult:
     system, store = pipeline.engine.system, pipeline.store
-    row = file_row(path)
+    row = file_row(path, start)
     with store.write() as connection:
         work.add_recording(connection, row)
     kept = Counter[str]()

@@ -145,7 +145,7 @@ class DiagnosisJobs:
         shutil.rmtree(part, ignore_errors=True)
         engine, seconds = served.engine, self._settings.diagnosis_seconds
         request = DiagnosisRequest(
-            path, row.name, engine.system, engine.dbc, part, text or self._shared_text(), SEARCH * seconds
+            path, row.name, engine.system, engine.dbc, part, text or self._shared_text(), SEARCH * seconds, row.began_ns
         )
         worker = Worker(
             self.task, request, ProcessLimits(seconds, seconds, self._settings.worker_memory_bytes), "the diagnosis"

@@ -23,6 +23,7 @@ class DiagnosisRequest:
     out: Path  # folder for page, pictures and report; made when absent
     system_text: str | None = None  # source of the system: findings are written into a copy
     search_seconds: float = math.inf  # time limit of the search
+    start: int | None = None  # ns since 1970, when the recording began if its times count from 0
 
 
 @dataclass(frozen=True, slots=True)

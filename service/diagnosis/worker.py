@@ -82,7 +82,7 @@ def within(stage: Stage, seconds: float) -> Stage:
 def _load(request: DiagnosisRequest) -> Record:
     if request.path.suffix == ".npz":
         return load_excerpt(request.path)
-    return open_record(request.path, request.system, request.dbc, signals=True)
+    return open_record(request.path, request.system, request.dbc, request.start, signals=True)
 
 
 def save_excerpt(path: Path, excerpt: Excerpt) -> None:

@@ -48,6 +48,7 @@ class RecordingJobs:
                 on_batch=on_batch,
                 on_tally=self._counter(),
                 check=progress.check,
+                start=row.began_ns,
             )
         except (UnreadableRecording, UserError) as error:
             raise UserError(str(error).replace(str(path), row.name)) from error
@@ -75,10 +76,10 @@ def stored_file(settings: Settings, store: Store, job: JobRow) -> tuple[Path, wo
     return path, row
 
 
-def file_row(path: Path) -> work.RecordingRow:
-    """The store's row of a file on this machine."""
+def file_row(path: Path, began: int | None = None) -> work.RecordingRow:
+    """The store's row of a file on this machine; began: ns since 1970, as the user says."""
     return work.RecordingRow(
-        work.new_id(), None, path.name[:255], "file", None, path.stat().st_size, None, now_ns(), None
+        work.new_id(), None, path.name[:255], "file", None, path.stat().st_size, None, now_ns(), None, began
     )
 
 

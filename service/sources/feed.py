@@ -130,7 +130,8 @@ def feed_file(
         if other is not None:
             raise UserError(
                 f"{path}: its times count from 0, and from {to_iso(piece.windows[0].start)} on, as the file's own time "
-                f"has it, there is {other} of {fed.vehicle} already; say when it began (sprung replay --start)"
+                f"has it, there is {other} of {fed.vehicle} already; say when it began (`sprung replay --start`, "
+                "`start` beside an uploaded file)"
             )
 
     found = prefetched(_identified(pipeline, fed, reading, name, priority, check, refuse), 1, check)

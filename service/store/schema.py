@@ -106,6 +106,7 @@ recordings = Table(
     Column("tally", JSON, nullable=True),  # {"used": n, ...}
     Column("created_ns", BigInteger, nullable=False),
     Column("finished_ns", BigInteger, nullable=True),
+    Column("began_ns", BigInteger, nullable=True),  # as its sender has said, for times that count from 0
 )
 
 windows = Table(  # PostgreSQL keeps a partition a month (`service.store.partitions`): the key holds the time

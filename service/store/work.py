@@ -29,6 +29,7 @@ class RecordingRow:
     tally: dict[str, Any] | None
     created_ns: int
     finished_ns: int | None
+    began_ns: int | None = None  # as its sender has said, for times that count from 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +94,8 @@ def upload_name(digest: str, recording_id: str, extension: str) -> str:
 
 
 def same_upload(connection: Connection, row: RecordingRow, vehicle: str | None) -> RecordingRow | None:
-    """An upload with the same content and name, sent for the same vehicle before, whose file is still kept."""
+    """An upload with the same content, name and stated start, sent for the same vehicle before, whose file is still
+    kept."""
     if row.file is None or len(row.file) <= DIGITS or row.source != "upload":
         return None
     query = (
@@ -101,6 +103,7 @@ def same_upload(connection: Connection, row: RecordingRow, vehicle: str | None) 
         .join(jobs, jobs.c.recording_id == recordings.c.id)
         .where(recordings.c.file.startswith(f"{row.file[:DIGITS]}-", autoescape=True))
         .where(recordings.c.name == row.name, recordings.c.source == "upload")
+        .where(recordings.c.began_ns.is_not_distinct_from(row.began_ns))
         .where(jobs.c.vehicle_id.is_not_distinct_from(vehicle))
         .limit(1)
     )

@@ -25,7 +25,9 @@ from sprung.service.monitoring.engine import Engine
 from sprung.service.processes.worker import Emit
 from sprung.service.report.writing import write_report
 from sprung.service.settings import Settings
+from sprung.service.store import work
 from sprung.service.store.circumstances import WindowCircumstances, add_circumstances
+from sprung.service.store.lists import list_jobs
 from sprung.service.store.schema import fleet_status
 from tests.oidc_provider import provider_settings, running_provider
 from tests.report_made import friction_report
@@ -463,12 +465,16 @@ def test_an_upload_is_followed_to_its_report_and_what_was_found_is_put_to_use(
     page.goto(f"{address}/pages/work")
     page.set_input_files("#file", tmp_path / "ride.csv")
     page.fill("#vehicle", "car-18")
+    page.fill("#start", "2026-09-21T14:13:20")
     page.select_option("#what", "/diagnose")
     page.get_by_role("button", name="Upload").click()
     page.locator("progress#sent").wait_for()
     page.locator("#outcome:has-text('diagnosis')").wait_for()
     page.locator("#jobs:has-text('diagnosis')").wait_for()  # listed as soon as it is taken
     kept(page, "upload")
+    with core.store.read() as connection:
+        row = work.get_recording(connection, str(list_jobs(connection, 1)[0].recording_id))
+    assert row is not None and row.began_ns == 1_790_000_000 * 10**9
     page.wait_for_selector("a:has-text('report: missing physics')", timeout=180_000)  # the page has come anew
     page.click("a:has-text('report: missing physics')")
     assert page.inner_text("h1") == "dry friction"

@@ -16,6 +16,7 @@
     const file = form.elements.file.files[0];
     if (!file) return;
     if (form.elements.vehicle.value.trim()) body.append("vehicle", form.elements.vehicle.value.trim());
+    if (form.elements.start.value) body.append("start", `${form.elements.start.value}Z`);
     body.append("file", file);
     const request = new XMLHttpRequest();
     request.open("POST", form.elements.what.value);

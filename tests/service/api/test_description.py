@@ -121,6 +121,10 @@ def test_the_typed_client_uploads(address: str, tmp_path: Path, reading_here: No
     (tmp_path / "ride.csv").write_text("time,a\n0,1\n0.01,2\n")
     job = client.upload(tmp_path / "ride.csv", vehicle="b")
     assert client.wait(job.id, 60).state in ("done", "failed")
+    job = client.upload(tmp_path / "ride.csv", vehicle="b", start="2026-09-21T14:13:20Z")
+    with urllib.request.urlopen(f"{address}/recordings") as answer:
+        starts = {line["id"]: line["start"] for line in json.load(answer)["recordings"]}
+    assert starts[job.recording] == "2026-09-21T14:13:20.000Z" and None in starts.values()
 
 
 def test_a_generated_client_reads_a_vehicle(address: str, tmp_path: Path) -> None:

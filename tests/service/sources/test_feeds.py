@@ -119,6 +119,47 @@ def test_the_same_upload_twice_stores_nothing_twice(client: TestClient, recordin
     assert client.get("/vehicles/bus-7").json()["windows"]["used"] == 9
 
 
+@pytest.fixture
+def from_zero(recording: Path) -> Path:
+    """The same, with times that count from 0."""
+    head, *rows = recording.read_text().splitlines()
+    path = recording.with_name("from zero.csv")
+    path.write_text("\n".join([head, *(f"{i / 100},{row.partition(',')[2]}" for i, row in enumerate(rows))]))
+    return path
+
+
+def test_uploads_whose_times_count_from_0_begin_when_their_sender_says(client: TestClient, from_zero: Path) -> None:
+    for number, start in enumerate(("2026-09-21T14:00:00Z", "2026-09-21T16:00:00+02:00", "1790000000")):
+        done = finished(client, upload(client, from_zero, vehicle="a", start=start).json())
+        assert done["state"] == "done", done
+        assert client.get("/vehicles/a").json()["windows"]["used"] == (9, 9, 18)[number]  # the second is the first
+        line = client.get("/recordings").json()["recordings"][0]
+        assert line["start"] == ("2026-09-21T14:13:20.000Z" if number == 2 else "2026-09-21T14:00:00.000Z")
+    at = client.get("/vehicles/a/history", params={"parameter": "primary_11l.stiffness", "resolution": "raw"}).json()
+    assert [point["time"][:19] for point in at["points"]][::9] == ["2026-09-21T14:00:00", "2026-09-21T14:13:20"]
+    assert len(client.get("/recordings").json()["recordings"]) == 2  # of one start the file is kept once
+
+
+def test_an_upload_among_windows_of_another_is_taken_with_its_start(client: TestClient, from_zero: Path) -> None:
+    assert finished(client, upload(client, from_zero, vehicle="a", start="1790000000").json())["state"] == "done"
+    again = upload(client, from_zero, "other.csv", vehicle="a", start="1790000060").json()
+    assert finished(client, again)["state"] == "done"
+    assert client.get("/vehicles/a").json()["windows"]["used"] == 18
+
+
+@pytest.mark.parametrize(
+    "start", ["noon", "2026-09-21", "2026-09-21T14:13:20", "-5", "1e300", "nan", "2199-01-01T00:00:00Z"]
+)
+@pytest.mark.parametrize("place", ["/recordings", "/diagnose"])
+def test_a_start_that_is_no_time_is_refused_and_nothing_is_kept(
+    client: TestClient, core: Core, from_zero: Path, place: str, start: str
+) -> None:
+    with open(from_zero, "rb") as stream:
+        answer = client.post(place, files={"file": (from_zero.name, stream)}, data={"start": start})
+    assert answer.status_code == 422 and answer.json()["errors"][0]["field"] == "start"
+    assert list(core.settings.uploads.iterdir()) == [] and client.get("/recordings").json()["recordings"] == []
+
+
 @pytest.mark.parametrize("name", ["../../etc/cron.d/evil.csv", "..\\..\\evil.csv", "/abs/evil.csv", "a\0b.csv"])
 def test_no_name_of_a_client_reaches_the_file_system(
     client: TestClient, core: Core, recording: Path, name: str

@@ -87,9 +87,10 @@ def test_vehicles_that_an_earlier_version_called_well_unheard_are_not_called_so_
     with store.write() as connection:
         for vehicle in ("unheard", "heard"):
             fleet.ensure_vehicle(connection, vehicle, START)
+    _migrate(store, "downgrade", "0009")
+    with store.write() as connection:
         connection.execute(text("update fleet_status set health = 'ok'"))
         connection.execute(text("update fleet_status set revision = 1, last_window_ns = 1 where vehicle_id = 'heard'"))
-        connection.execute(text("update alembic_version set version_num = '0009'"))
     store.close()
     store = open_store(str(path))
     with store.read() as connection:
