@@ -66,7 +66,7 @@ def test_a_bomb_costs_neither_time_nor_memory(method: str) -> None:
                 Inflater(0).inflate(method, bomb, stated)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert time.process_time() - started < 0.5
+    assert time.process_time() - started < 2.0
     assert peak < 8 << 20
 
 
@@ -86,7 +86,7 @@ def test_an_mcap_bomb_is_a_damaged_chunk(method: str, stated: int, tmp_path: Pat
     account = Account()
     started = time.process_time()
     assert list(McapFile(path, account).batches()) == []
-    assert time.process_time() - started < 0.5
+    assert time.process_time() - started < 2.0
     assert account.incomplete
     assert any("damaged chunk" in line for line in account.problems)
 
@@ -97,7 +97,7 @@ def test_a_chunk_of_nothing_is_not_walked_through_record_by_record(tmp_path: Pat
     account = Account()
     started = time.process_time()
     assert list(McapFile(path, account).batches()) == []
-    assert time.process_time() - started < 1.0
+    assert time.process_time() - started < 4.0
     assert "without a kind" in account.problems[0]
 
 
@@ -109,6 +109,6 @@ def test_a_blf_bomb_is_a_damaged_container(stated: int, tmp_path: Path) -> None:
     account = Account()
     started = time.process_time()
     assert list(frames(path, account)) == []
-    assert time.process_time() - started < 0.5
+    assert time.process_time() - started < 2.0
     assert account.incomplete
     assert "container" in account.problems[-1]

@@ -211,7 +211,7 @@ def test_sign_ins_that_wait_for_a_provider_hold_up_nobody_else(
             time.sleep(0.5)
             begun = time.monotonic()
             assert status("/vehicles", authorization=f"Bearer {token}") == 200
-            assert time.monotonic() - begun < 3.0  # the provider's five seconds are not over
+            assert time.monotonic() - begun < 4.5  # the provider's five seconds are not over
             for one in people:
                 one.join()
 
