@@ -79,13 +79,21 @@ def postgres() -> Iterator[postgres_tests.PostgresServer]:
         yield running
 
 
+@pytest.fixture(scope="session")
+def postgres_template(postgres: postgres_tests.PostgresServer) -> str:
+    """Name of a database with nothing in it but the newest schema."""
+    url = postgres.database()
+    open_store(url).close()
+    return url.rpartition("/")[2]
+
+
 @pytest.fixture(params=["sqlite", "postgresql"])
 def any_store(request: pytest.FixtureRequest, tmp_path: Path, empty_store: Path) -> Iterator[Store]:
     """The store, once on every database."""
     if request.param == "sqlite":
         url = f"sqlite:///{shutil.copy(empty_store, tmp_path / 'test.db')}"
     else:
-        url = request.getfixturevalue("postgres").database()
+        url = request.getfixturevalue("postgres").database(request.getfixturevalue("postgres_template"))
     opened = open_store(url)
     yield opened
     opened.close()

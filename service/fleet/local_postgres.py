@@ -67,14 +67,14 @@ class PostgresServer:
         """Of the postmaster."""
         return int((self.folder / "data" / "postmaster.pid").read_text().splitlines()[0])
 
-    def database(self) -> str:
-        """The URL of a new, empty database."""
+    def database(self, template: str = "template1") -> str:
+        """The URL of a new database, which holds what its template does: by default nothing."""
         import psycopg
 
         self._made += 1
         name = f"sprung_{self._made}"
         with psycopg.connect(self.url("postgres").replace("+psycopg", ""), autocommit=True) as connection:
-            connection.execute(f"CREATE DATABASE {name}")
+            connection.execute(f"CREATE DATABASE {name} TEMPLATE {template}")
         return self.url(name)
 
     def url(self, name: str) -> str:

@@ -164,6 +164,7 @@ def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values() -> No
     assert values["spring.damping"] == pytest.approx(DAMPING, rel=0.05)
 
 
+@pytest.mark.slow
 def test_friction_shows_in_a_free_decay_without_any_input() -> None:
     """No excitation: a model with everything scaled down fits ever better, were it not for the determinant."""
     record = simulate(lambda d, v, z: 3.0 * np.tanh(v / 5e-3), seconds=4.0, level=0.0, start=0.01)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.baseline import refreshed
+from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.along_motion import with_laws_along_motion
@@ -134,13 +134,17 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     if ended:  # values and noise levels of the last finding may not have been fitted to the end
         problem, fit = refreshed(replace(state.problem, work=None), state.fit)
         state = replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise))
+    state = replace(state, fit=settled(replace(state.problem, work=None), state.fit))
     state = without_insignificant(state)
     progress(0.93, "the model on the whole recording")
     final = _on_whole_recording(state)
     fewer = without_refuted(state, final)
     if fewer is not None:
         return concluded(fewer, progress)
-    final = replace(final, covariance=final.covariance + form_covariance(state) + shared_gain_covariance(state))
+    # what an unconverged fit still promised to fall is as far as its values may yet move
+    moving = 0.0 if final.converged else final.left / final.grain
+    added = form_covariance(state) + shared_gain_covariance(state)
+    final = replace(final, covariance=(1 + moving) * final.covariance + added)
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
     judgement = judged(state, before, after, noisy, ended)
@@ -238,4 +242,4 @@ def _on_whole_recording(state: Investigation) -> Fit:
     problem = replace(state.problem, part=part, work=None)
     fit = try_optimise(problem, state.held.run(state.fit.point).point, 4)
     most = state.options.rules.acceptance.diverged * state.fit.reduced
-    return fit if fit is not None and fit.reduced < most else state.fit
+    return settled(problem, fit) if fit is not None and fit.reduced < most else state.fit

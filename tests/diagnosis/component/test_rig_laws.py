@@ -90,6 +90,7 @@ def test_friction_whose_fall_is_not_identifiable_is_plain_friction_where_more_th
     assert found.steps[0].rivals[0].last.effect == "stribeck"
 
 
+@pytest.mark.slow
 def test_friction_of_a_sliding_bearing_rises_from_creeping_to_fast_sliding() -> None:
     sliding = np.tanh(V / 1e-3) * (250.0 - 160.0 * np.exp(-np.abs(V) / 0.06))
     report = diagnosed(K * D + 300.0 * V + sliding)
@@ -143,6 +144,7 @@ def late(signal: np.ndarray, time_constant: float) -> np.ndarray:
     return found
 
 
+@pytest.mark.slow
 def test_a_yield_force_that_follows_a_voltage_late_keeps_its_slope_below_yielding() -> None:
     """As of a magnetorheological damper: the current takes its time, and the fluid is as viscous at any current."""
     u = voltage()

@@ -10,6 +10,7 @@ from sprung.benchmarks.setup_rigs import RigRecord
 from sprung.model.diagnosis.api import diagnose
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 9])
 def test_two_masses_beside_exact_instruments_are_no_springs_and_no_gains(number: int) -> None:
     """Sprung +3.3 % and unsprung -5.8 %, or +1.9 % and -6.5 %: an air spring of the tyre fits better than either."""

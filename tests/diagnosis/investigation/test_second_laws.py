@@ -18,6 +18,7 @@ def _friction_by_the_rate(d: float, v: float) -> float:
     return float(np.tanh(v / 1e-3) * (FAST + (SLOW - FAST) * np.exp(-abs(v) / TURNS)))
 
 
+@pytest.mark.slow
 def test_plain_friction_beside_a_valve_is_told_as_both() -> None:
     report = diagnose(quarter_car(), simulate(_friction_and_valve, seconds=12, seed=2))
     found = {finding.effect: {p.name: p for p in finding.parameters} for finding in report.findings}

@@ -41,7 +41,7 @@ def test_a_right_set_up_is_left_alone(vehicle: tuple[System, np.ndarray]) -> Non
     [
         "left and right",
         "late inputs",
-        "element at another body",
+        pytest.param("element at another body", marks=pytest.mark.slow),
         pytest.param("upside down", marks=pytest.mark.slow),
         pytest.param("scale of a node", marks=pytest.mark.slow),
     ],
@@ -54,6 +54,7 @@ def test_a_wrong_set_up_is_named_at_its_channels(kind: str, vehicle: tuple[Syste
     assert frozenset(fault.site.location.split("|")) == wrong.channels
 
 
+@pytest.mark.slow
 def test_all_sensors_of_two_bodies_exchanged_are_no_other_structure() -> None:
     """Under a road whose displacement alone is measured; each pair by itself would explain too little."""
     once = parse_system(QUARTER_CAR.replace("    velocity: {csv: v, noise: 5.0e-4}\n", ""))
@@ -62,6 +63,7 @@ def test_all_sensors_of_two_bodies_exchanged_are_no_other_structure() -> None:
     assert (fault.effect.name, fault.site.location) == ("channels_swapped", "car_a|bogie_a|car_b|bogie_b")
 
 
+@pytest.mark.slow
 def test_a_delay_is_estimated_with_its_deviation(vehicle: tuple[System, np.ndarray]) -> None:
     system, values = vehicle
     names = [channel.name for channel in system.channels]

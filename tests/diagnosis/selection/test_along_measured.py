@@ -88,6 +88,7 @@ def test_what_is_fitted_along_the_measured_motion_begins_near_the_truth() -> Non
     assert simulated.point.terms[-1].parameters[0] == pytest.approx(FAST, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_step_is_not_rejected_for_the_free_motion_beside_it_alone() -> None:
     """A slowly decaying motion that friction dominates: no step from there was accepted, the right ones included."""
     system, record = parse_system(SLAB), earthquake(slow=FAST, filtered=True)

@@ -100,6 +100,7 @@ def test_chance_is_uniform_for_noise() -> None:
     assert chance(-5.0, 1, 100) == 1.0
 
 
+@pytest.mark.slow
 def test_the_whole_recording_settles_what_its_fitted_part_does_not() -> None:
     """One amplitude, estimated on 0.7 of a recording, then predicts the rest; true: 0 or 3.4 deviations."""
     alpha, draws, share = 0.003, 40_000, np.array([0.7, 0.3])
