@@ -119,8 +119,9 @@ def isolation(cases: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]
     Every hypothesis "this value, and no other, has left its healthy scatter" is judged by its evidence under the sum of
     the windows' information; loads, speeds and tracks are each window's own.
     """
-    names = [f"{e}.{q}" for q in ("stiffness", "damping") for e in read_vehicle(SYSTEM).elements]
-    found: dict[str, list[tuple[bool, bool, float]]] = {"primary": [], "secondary": []}
+    vehicle = read_vehicle(SYSTEM)
+    names = [f"{e}.{q}" for q in ("stiffness", "damping") for e in vehicle.elements]
+    found: dict[str, list[tuple[bool, bool, float, float]]] = {"primary": [], "secondary": []}
     for number in range(cases):
         rng = np.random.default_rng([seed, 1, number])
         stage = ("primary", "secondary")[number % 2]
@@ -129,9 +130,10 @@ def isolation(cases: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]
         values[hit] += np.log(rng.uniform(*DAMAGE))
         said, size = verdict(rng, values, seconds)
         same_place = names[said].split(".")[0] == names[hit].split(".")[0]
-        found[stage].append((said == hit, same_place, abs(size - np.exp(values[hit])) if said == hit else np.nan))
+        error = abs(size - np.exp(values[hit])) if said == hit else np.nan
+        found[stage].append((said == hit, same_place, error, size_bound(vehicle, rng, values, hit, seconds)))
     for stage, seen in found.items():
-        right, place, error = (np.array(part) for part in zip(*seen, strict=True))
+        right, place, errors, least = (np.array(part) for part in zip(*seen, strict=True))
         yield {
             "figure": "isolation",
             "stage": stage,
@@ -139,9 +141,26 @@ def isolation(cases: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]
             "minutes": MINUTES * seconds / 60,
             "isolated_percent": float(100 * np.mean(right)),
             "element_percent": float(100 * np.mean(place)),
-            "size_error_percent": [float(100 * np.nanmean(error)), float(100 * np.nanstd(error))],
+            "size_error_percent": [float(100 * np.nanmean(errors)), float(100 * np.nanstd(errors))],
+            # mean and standard deviation of the absolute error of an estimator at the bound
+            "size_bound_percent": [
+                float(100 * np.mean(least) * np.sqrt(2 / np.pi)),
+                float(100 * np.sqrt(np.mean(least**2) - 2 / np.pi * np.mean(least) ** 2)),
+            ],
             "published": dict(zip(("isolated", "error_mean", "error_std"), PUBLISHED[stage], strict=True)),
         }
+
+
+def size_bound(vehicle: Vehicle, rng: np.random.Generator, values: Array, hit: int, seconds: float) -> float:
+    """Standard deviation of what is left of a value that no unbiased estimator can beat, from `MINUTES` rides such as
+    those of a verdict, where it is known which value has changed and the others lie within their scatter."""
+    information = np.full(len(values), SCATTER**-2.0)
+    information[hit] = 0.0
+    whole = np.diag(information)
+    for _ in range(MINUTES):
+        ride = replace(draw_ride(rng), log_ratio=values)
+        whole += np.linalg.inv(bound_covariance(vehicle, ride, TWO, seconds)[:24, :24])
+    return float(np.exp(values[hit]) * np.sqrt(np.linalg.inv(whole)[hit, hit]))
 
 
 def verdict(rng: np.random.Generator, values: Array, seconds: float) -> tuple[int, float]:
@@ -172,7 +191,12 @@ def verdict(rng: np.random.Generator, values: Array, seconds: float) -> tuple[in
 
 
 def bound(vehicle: Vehicle, ride: DrawnRide, sensors: list[int], seconds: float) -> Array:
-    """Standard deviations (24 parameters, load) that no unbiased estimator can beat, for a stationary record.
+    """Standard deviations (24 parameters, load) that no unbiased estimator can beat, for a stationary record."""
+    return np.asarray(np.sqrt(np.diag(bound_covariance(vehicle, ride, sensors, seconds))))
+
+
+def bound_covariance(vehicle: Vehicle, ride: DrawnRide, sensors: list[int], seconds: float) -> Array:
+    """Covariance (25, 25) of 24 parameters and the load that no unbiased estimator can beat, for a stationary record.
 
     Slepian-Bangs: F_ij = T integral over f of tr S^-1 dS/dx_i S^-1 dS/dx_j, everything else free: two levels and one
     coherence per octave, a share of its own for every wheel, the speed.
@@ -200,7 +224,7 @@ def bound(vehicle: Vehicle, ride: DrawnRide, sensors: list[int], seconds: float)
     information = (rows @ rows.conj().T).real * seconds * (frequency[1] - frequency[0])
     scale = np.sqrt(np.diag(information))
     covariance = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
-    return np.asarray(np.sqrt(np.diag(covariance))[:25])
+    return np.asarray(covariance[:25, :25])
 
 
 def _octaves(frequency: Array) -> Array:

@@ -74,7 +74,8 @@ def _hour(number: int, seed: int, seconds: float, cruise: tuple[float, float]) -
         if moment.time > SETTLED and ran % 60 == 0:
             mean, std = engine.tracker.posterior(state)
             scores.append((mean - timetable.log_ratio(vehicle, moment.time)) / std)
-            for value, deviation in engine.tracker.loads(state).values():
+            of_this_run = engine.tracker.loads_as_of(state) is None  # not what the run before the stop had carried
+            for value, deviation in engine.tracker.loads(state).values() if of_this_run else ():
                 truth = float(np.log1p(timetable.at(timetable.load, moment.time)))
                 loads.append(((value - truth) / deviation, value - truth))
     score, load = np.array(scores), np.array(loads).reshape(-1, 2)

@@ -216,7 +216,10 @@ class Fusion:
         assert state.weather is not None
         at = weathers.features(state.weather, conditions, self.load(belief))
         usable = mask & (state.changes.learned >= settings.learning)
-        weather = weathers.at_conditions(state.weather, self.weather, at, learning=not self.armed(state))
+        learning, elapsed = not self.armed(state), 0.0 if state.last is None else (window.time_ns - state.last) * 1e-9
+        departs = elapsed - settings.window > dev.STOPPED
+        weather = weathers.ridden(state.weather, elapsed, learning=learning, departs=departs)
+        weather = weathers.at_conditions(weather, self.weather, at, learning=learning)
         residual = np.where(usable, window.value - shift - np.where(usable, state.changes.baseline, 0.0), 0.0)
         weather = weathers.update_common(weather, self.weather, residual, variance, usable, window.centre)
         effect = np.where(usable, weather.effect + weathers.common_effect(weather, self.weather), 0.0)

@@ -186,7 +186,7 @@ def _weather(data: Mapping[str, Any]) -> Weather | None:
     shapes = {"mean": (-1, size), "covariance": (-1, size, size)}
     shaped = {name: arrays[name].reshape(shapes[name.removeprefix("kind_")]) for name in
               ("mean", "covariance", "kind_mean", "kind_covariance")}  # fmt: skip
-    return Weather(**{"warmth": np.full(1, np.nan)} | arrays | shaped)
+    return Weather(**{"warmth": np.full(1, np.nan), "shared": np.zeros(1)} | arrays | shaped)
 
 
 def _cargo(data: Mapping[str, Any]) -> Cargo | None:

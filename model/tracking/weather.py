@@ -32,7 +32,10 @@ ALIKE = 1.5  # ratio of nominal values within which elements of a quantity are o
 MOST_OF = 0.75  # of a kind that must move together
 FEWEST_VEHICLES = 3  # that must have learned a slope before it becomes a prior of others
 FIRST_WEEKS = 21 * 86400.0  # s in which slopes are learned
-CORRELATED = 600.0, 0.005  # correlation time in s, and standard deviation, of errors that windows have in common
+CORRELATED = (
+    600.0,
+    0.005,
+)  # correlation time in s, and standard deviation, of errors that windows of a ride have in common
 OF_KINDS = 3600.0, 0.01  # the same for a kind: oil and air temperature differ
 COMMON_WALK = 0.005 / math.sqrt(600.0)  # per sqrt(s), random walk of a kind's common level while the vehicle runs
 PAUSE_WALK = 0.02 / math.sqrt(3600.0)  # per sqrt(s), while it stands
@@ -86,6 +89,7 @@ class Weather:
     effect: FloatArray  # of the conditions of the last window on each parameter, shape (P,)
     doubt: FloatArray  # its variance, shape (P,)
     warmth: FloatArray  # the last temperature that was measured, 10 K; NaN: none, shape (1,)
+    shared: FloatArray  # correlation of what windows have in common with that in the baseline, shape (1,)
 
 
 def model_of(
@@ -137,7 +141,7 @@ def start(model: WeatherModel) -> Weather:
     return Weather(
         model.mean.copy(), covariances[0], model.kind_mean.copy(), covariances[1], np.zeros(CONDITIONS),
         np.zeros(CONDITIONS), np.zeros(G), np.zeros(G), np.zeros(G), np.zeros(G), np.zeros(2, dtype=np.int64),
-        np.zeros(P), np.zeros(P), np.full(1, math.nan),
+        np.zeros(P), np.zeros(P), np.full(1, math.nan), np.ones(1),
     )  # fmt: skip
 
 
@@ -167,6 +171,21 @@ def features(weather: Weather, conditions: Conditions | None, load: float | None
     return np.array([warmth, math.nan if load is None else load, speed / SPEED])
 
 
+def ridden(weather: Weather, seconds: float, *, learning: bool, departs: bool) -> Weather:
+    """`weather` so many seconds of a ride later.
+
+    learning: the baseline is being learned.  departs: from a stop, after which what windows have in common is another.
+    """
+    shared = 1.0 if learning else 0.0 if departs else float(weather.shared[0]) * math.exp(-seconds / CORRELATED[0])
+    return replace(weather, shared=np.full(1, shared))
+
+
+def _of_offset(weather: Weather) -> float:
+    """Share of its offset that a parameter has by now: what windows have in common is part of the baseline, too, and
+    goes astray from it only as fast as it changes."""
+    return math.sqrt(1.0 - float(weather.shared[0]) ** 2)
+
+
 def at_conditions(weather: Weather, model: WeatherModel, at: FloatArray, *, learning: bool) -> Weather:
     """`weather` with the effect of conditions `at` (K,); `learning`: the baseline is being learned under them.
 
@@ -179,7 +198,7 @@ def at_conditions(weather: Weather, model: WeatherModel, at: FloatArray, *, lear
         weight = weather.weight + taken
         moved = np.where(taken, np.where(known, at, 0.0) - weather.reference, 0.0) / np.maximum(weight, 1)
         weather = replace(weather, reference=weather.reference + moved, weight=weight)
-    x = np.concatenate([[0.0 if learning else 1.0], np.where(known, at - weather.reference, 0.0)])
+    x = np.concatenate([[_of_offset(weather)], np.where(known, at - weather.reference, 0.0)])
     kinds = weather.kind_mean[:, 1:] @ x[1:]  # a kind's own offset is part of its common level
     return replace(weather, effect=weather.mean @ x + model.of_kinds(kinds), doubt=(weather.covariance @ x) @ x)
 
@@ -198,7 +217,7 @@ def update_slopes(
     in_time = (time - int(weather.began[0])) * 1e-9 < FIRST_WEEKS
     if not in_time or not usable.any():
         return weather
-    x = np.concatenate([[1.0], np.where(np.isfinite(at), at - weather.reference, 0.0)])
+    x = np.concatenate([[_of_offset(weather)], np.where(np.isfinite(at), at - weather.reference, 0.0)])
     own = residual - common_effect(weather, model) - (weather.effect - weather.mean @ x)
     mean, covariance = _regressed(
         weather.mean, weather.covariance, x, own, _floored(variance, CORRELATED, seconds), usable

@@ -162,6 +162,60 @@ def test_a_kind_alone_is_named_by_what_its_names_share() -> None:
     assert [alarm.parameter for alarm in state.active] == ["primary_*.damping"]
 
 
+def test_a_step_soon_after_the_baseline_was_learned_is_alarmed_in_time() -> None:
+    """What windows of a ride have in common is in the baseline, too, which is therefore not uncertain at once."""
+    follow, second = Tracker(tracker().parameters), 1_000_000_000
+    for vehicle in range(12):
+        rng = np.random.default_rng([11, vehicle])
+        covariance = correlated(rng, 0.85 * STD)
+        root, index = np.linalg.cholesky(covariance), 12 + vehicle % 8
+        state, step = follow.initial_state(), np.zeros(24)
+        for k in range(70):
+            step[index] = 0.05 if k >= 40 else 0.0
+            window = estimate(step + root @ rng.standard_normal(24), covariance)
+            state = follow.update(state, window, EPOCH + k * second)
+        assert [alarm.parameter for alarm in state.active] == [NAMES[index]]
+
+
+def test_what_windows_of_a_ride_have_in_common_is_another_after_a_stop() -> None:
+    rng, follow, second = np.random.default_rng(12), Tracker(tracker().parameters), 1_000_000_000
+    covariance = correlated(rng, STD)
+    root = np.linalg.cholesky(covariance)
+
+    def ride(state: TrackerState, seconds: range) -> TrackerState:
+        for k in seconds:
+            window = estimate(root @ rng.standard_normal(24), covariance)
+            state = follow.update(state, window, EPOCH + k * second)
+        return state
+
+    def spread(state: TrackerState) -> float:
+        assert state.weather is not None
+        return float(np.sqrt(state.weather.doubt.max()))
+
+    riding = ride(follow.initial_state(), range(50))
+    assert 0.0 < spread(riding) < 0.0015
+    later = ride(riding, range(50, 300))
+    assert spread(riding) < spread(later) < 0.005
+    assert spread(ride(riding, range(80, 81))) == pytest.approx(0.005, rel=0.02)
+    state = riding.to_dict()
+    del state["weather"]["shared"]  # as an earlier version has kept it: nothing is known to be shared
+    assert spread(ride(TrackerState.from_dict(state), range(50, 51))) == pytest.approx(0.005, rel=0.02)
+
+
+def test_what_windows_have_in_common_alarms_nothing_while_it_changes() -> None:
+    follow, second = Tracker(tracker().parameters), 1_000_000_000
+    for vehicle in range(2):
+        rng = np.random.default_rng([13, vehicle])
+        covariance = correlated(rng, STD)
+        root, shared = np.linalg.cholesky(covariance), 0.005 * rng.standard_normal(24)
+        state = follow.initial_state()
+        for k in range(400):
+            shared = np.exp(-1 / 600) * shared + 0.005 * np.sqrt(-np.expm1(-2 / 600)) * rng.standard_normal(24)
+            window = estimate(shared + root @ rng.standard_normal(24), covariance)
+            state = follow.update(state, window, EPOCH + k * second)
+        assert state.alarms == ()
+
+
 def test_what_was_learned_survives_a_restart_bit_for_bit() -> None:
     rng = np.random.default_rng(6)
     state = day(rng, tracker().initial_state(), 300, lambda k: warm(k)[1], lambda k: Conditions(temperature=warm(k)[0]))
