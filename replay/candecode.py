@@ -16,13 +16,13 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-import cantools
 import numpy as np
 from cantools.database import Database, Message, Signal
 from numpy.typing import NDArray
 
 from sprung.model.signals import BoolArray, Channel, FloatArray, SampleBlock
 from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.candatabase import load_database
 from sprung.replay.frames import EXTENDED, ByteArray, FrameBlock, WordArray, id_text, last_byte, raw_bits
 
 INVALID_CHOICE = re.compile(
@@ -31,8 +31,6 @@ INVALID_CHOICE = re.compile(
     re.IGNORECASE,
 )
 MOST_BYTES, FLOAT_BITS = 64, (16, 32, 64)  # of a frame of CAN FD; of a field in IEEE 754
-MOST_TRANSPORTED = 1785  # bytes of a message in several frames (SAE J1939-21), which a database may describe, too
-PLACE = re.compile(rb"\bSG_\s+(\w+)[^:\n]*:\s*(\d+)\|(\d+)@")  # of a signal in a DBC: name, first bit, bits
 ALL_ONES_BITS = 8  # a narrower field of all ones is an ordinary value
 
 
@@ -259,32 +257,6 @@ def _count_missing(
     for mask, reason in ((invalid, "marked invalid"), (outside, "outside the database's range")):
         if mask is not None:
             account.values[reason] += int((mask if chosen is None else mask & chosen).sum())
-
-
-def load_database(path: Path) -> Database:
-    """A cantools database (DBC, KCD, SYM, ARXML); raises UnreadableRecording with one line."""
-    try:
-        _no_giant(path)
-        database = cantools.database.load_file(path, strict=False)
-    except FileNotFoundError:
-        raise UnreadableRecording(f"{path}: no such CAN database") from None
-    except UnreadableRecording:
-        raise
-    except Exception as error:
-        line = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UnreadableRecording(f"{path}: not a CAN database that can be read: {line}") from error
-    if not isinstance(database, Database):
-        raise UnreadableRecording(f"{path}: a diagnostics database, not one of CAN messages")
-    return database
-
-
-def _no_giant(path: Path) -> None:
-    """Refuse a DBC with a signal of which cantools would draw a billion bits."""
-    if path.suffix.lower() != ".dbc":
-        return
-    for name, start, length in PLACE.findall(path.read_bytes()):
-        if int(start) + int(length) > 8 * MOST_TRANSPORTED:
-            raise _unheld(name.decode(), int(start), int(length))
 
 
 def _unheld(name: str, start: int, length: int) -> UnreadableRecording:

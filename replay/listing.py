@@ -14,7 +14,7 @@ from cantools.database import Database
 from sprung.model.signals import ANY_TIME, Channel, TimeColumn
 from sprung.replay import csvtable, parquet, series
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.candecode import load_database
+from sprung.replay.candatabase import load_database
 from sprung.replay.frames import EXTENDED
 from sprung.replay.mcapfields import Field, Topic
 from sprung.replay.mcapfile import McapFile

@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import can
-import cantools
 import numpy as np
 from cantools.database.can import Database, Message
 from mcap.writer import Writer
 
 from sprung.model.signals import Channel, FloatArray
+from sprung.replay.candatabase import load_database
 
 
 class UnwritableRecording(ValueError):
@@ -90,9 +90,7 @@ def _can(
 ) -> None:
     if dbc is None:
         raise UnwritableRecording(f"{path}: a CAN database is needed to write frames; give --dbc")
-    database = cantools.database.load_file(str(dbc))
-    if not isinstance(database, Database):
-        raise UnwritableRecording(f"{dbc}: is no CAN database")
+    database = load_database(Path(dbc), strict=True)
     messages = [(_message(database, name), fields) for name, fields in _grouped(path, channels, "can").items()]
     bus = "can0" if path.suffix == ".log" else 0
     with can.Logger(str(path)) as logger:

@@ -29,7 +29,7 @@ def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[st
         readable(path)
     settings = settings_with(options)
     if settings.dbc is not None:  # rather than with the first recording
-        from sprung.replay.candecode import load_database
+        from sprung.replay.candatabase import load_database
 
         load_database(settings.dbc)
     set_up(settings.log_format, settings.log_level)

@@ -154,7 +154,8 @@ def _text(kind: str, keep: Path) -> Callable[[bytes], None]:
     from sprung.model.schema import SystemFileError
     from sprung.model.system import load_system
     from sprung.replay import UnreadableRecording
-    from sprung.replay.candecode import CanDecoder, load_database
+    from sprung.replay.candatabase import load_database
+    from sprung.replay.candecode import CanDecoder
     from tests.fuzz.seeds import TABLE
 
     folder = Path(tempfile.mkdtemp(prefix="guided-"))

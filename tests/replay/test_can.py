@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike
 
 from sprung.model.signals import Channel
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.candecode import CanDecoder, load_database
+from sprung.replay.candatabase import load_database
+from sprung.replay.candecode import CanDecoder
 from sprung.replay.frames import EXTENDED, FrameBlock, id_text, raw_bits
 
 START = 1_790_000_000_000_000_000
