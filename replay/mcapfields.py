@@ -165,9 +165,8 @@ class Topic:
             return
         self._checked = True
         for wanted in self.fields:
-            if walk(document, wanted.path) is None:
-                names = _names(document)
-                text = ".".join(map(str, wanted.path))
+            names, text = _names(document), ".".join(map(str, wanted.path))
+            if walk(document, wanted.path) is None and text not in names:  # not one that is null in this message
                 near = get_close_matches(text, names, n=3, cutoff=0.3) or names[:5]
                 line = f"topic {self.name} has no field {text!r}; nearest: {', '.join(near)}"
                 self.account.problem(line, incomplete=False)

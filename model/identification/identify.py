@@ -76,8 +76,8 @@ class Identifier:
         windows: (B, T, C) in the order of `system.channels`, NaN columns for channels that are absent.
         start: log-ratios (B, P) to refine from, such as the tracker's; the estimator's where left out.
         weigh: windows (B,) whose evidence on gains, delays and loads is wanted, see `Estimate.deviating`.
-        A window that lacks inputs without which nothing can be said (`System.needed`) is not identified, with the
-        reason.  Errors: `UnusableWindow` for a wrong shape or infinite values.
+        A window that lacks all sensors, or inputs without which nothing can be said (`System.needed`), is not
+        identified, with the reason.  Errors: `UnusableWindow` for a wrong shape or infinite values.
         """
         windows = self._checked(windows)
         usable = self._usable(windows)
@@ -331,25 +331,32 @@ class Identifier:
             raise UnusableWindow(f"{channels[column].name}: not finite")
         return windows
 
+    def _needed(self) -> list[tuple[str, frozenset[str]]]:
+        """Sets of channels, of each of which a window must contain one at least: what they are, and their names."""
+        inputs = [("input", names) for names in self.system.needed]
+        return [*inputs, ("sensor", frozenset(self.system.sensors))]
+
     def _lacks(self, windows: FloatArray) -> BoolArray:
-        """Of which sets of `System.needed` windows (B, T, C) have no channel, (B, sets)."""
+        """Of which sets of `_needed` windows (B, T, C) have no channel, (B, sets)."""
         names = [channel.name for channel in self.system.channels]
         absent: BoolArray = np.asarray(np.isnan(windows).any(axis=1))
-        found: BoolArray = np.zeros((len(windows), len(self.system.needed)), dtype=np.bool_)
-        for i, some in enumerate(self.system.needed):
+        needed = self._needed()
+        found: BoolArray = np.zeros((len(windows), len(needed)), dtype=np.bool_)
+        for i, (_, some) in enumerate(needed):
             found[:, i] = absent[:, [names.index(name) for name in some]].all(axis=1)
         return found
 
     def _usable(self, windows: FloatArray) -> BoolArray:
-        """Which windows (B, T, C) have enough inputs, (B,)."""
+        """Which windows (B, T, C) have enough inputs and a sensor, (B,)."""
         return np.asarray(~self._lacks(windows).any(axis=1))
 
     def _unusable_among(self, windows: FloatArray, found: list[Estimate]) -> list[Estimate]:
         """One estimate for each of windows (B, T, C): those `found`, and none, with the reason, for the unusable."""
-        rest, P, S = iter(found), len(self.system.tracked), len(self.system.sensors)
-        first = [min(names) + (f" and {len(names) - 1} more" if len(names) > 1 else "") for names in self.system.needed]
+        left, P, S = iter(found), len(self.system.tracked), len(self.system.sensors)
+        more = [f" and {len(names) - 1} more" if len(names) > 1 else "" for _, names in self._needed()]
+        first = [f"missing {what} {min(names)}{rest}" for (what, names), rest in zip(self._needed(), more, strict=True)]
         return [
-            not_identified(P, S, f"missing input {first[int(np.argmax(lacks))]}") if lacks.any() else next(rest)
+            not_identified(P, S, first[int(np.argmax(lacks))]) if lacks.any() else next(left)
             for lacks in self._lacks(windows)
         ]
 

@@ -140,6 +140,21 @@ def test_a_window_that_does_not_fit_says_so(vehicle: tuple[System, FloatArray, R
     assert fits == [False, False, True, True]
 
 
+@pytest.mark.parametrize("inputs", [0, 4], ids=["all inputs", "some inputs"])
+def test_a_window_without_any_sensor_has_no_values_and_says_why(
+    vehicle: tuple[System, FloatArray, Runs], inputs: int
+) -> None:
+    system, _, runs = vehicle
+    identifier = Identifier(system)
+    windows = runs.values[:2].copy()
+    windows[1, :, :inputs] = np.nan
+    windows[1, :, len(system.inputs) :] = np.nan
+    for ask in (identifier.identify, lambda w: identifier.examine(w, np.ones(len(w), dtype=bool))):
+        found = ask(windows)
+        assert [e.identified for e in found] == [True, False]
+        assert found[1].reason == "missing sensor bogie1_1l and 11 more"
+
+
 def test_a_window_without_any_input_has_no_values_and_says_why(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, _, runs = vehicle
     identifier = Identifier(system)
