@@ -102,7 +102,7 @@ class Recording:
                 self.seen[block.channel[~np.isnan(block.value)]] = True
                 if shift is None:
                     shift = self._shift(int(block.time.min()))
-                yield SampleBlock(block.time + shift, block.channel, block.value) if shift else block
+                yield _begun(block, shift) if shift else block
         self._plausibility.conclude()
         if not self.seen[: len(self.seen) - self.beside].any():
             raise UnreadableRecording(self._nothing())
@@ -148,6 +148,12 @@ class Recording:
     def incomplete(self) -> bool:
         """Some of what was recorded is missing or damaged."""
         return self.account.incomplete
+
+
+def _begun(block: SampleBlock, shift: int) -> SampleBlock:
+    """Times that count from a start moved by `shift` ns; a clock that was set meanwhile is right by itself."""
+    counting = np.abs(block.time) < ABSOLUTE * SECOND
+    return SampleBlock(np.where(counting, block.time + shift, block.time), block.channel, block.value)
 
 
 @cache

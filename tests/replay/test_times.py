@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
 from sprung.model.signals import Channel, SampleBlock, Window
-from sprung.replay import UnreadableRecording
+from sprung.replay import UnreadableRecording, open_recording
 from sprung.replay.clock_messages import remarks
 from sprung.replay.plausibility import EARLIEST, LATEST
 from sprung.replay.record import load_record
@@ -128,3 +128,16 @@ def test_any_times_give_windows_in_time_and_memory(runs: list[tuple[int, int, in
         assert EARLIEST <= window.start <= LATEST
     assert all("\n" not in line for line in remarks(windower, len(windows)))
     assert windower.account.lost <= windower.account.expected
+
+
+def test_a_clock_that_is_set_during_a_ride_is_right_from_then_on(tmp_path: Path) -> None:
+    """It began in 1970; what had no date gets the one that is given, and what has one keeps it."""
+    path, start, set_at = tmp_path / "ride.csv", 1_795_000_000_000_000_000, 1_790_000_000.0
+    times = np.arange(0.0, 4.0, 0.01)
+    times[200:] += set_at
+    path.write_text("time,x\n" + "".join(f"{time:.2f},{row}\n" for row, time in enumerate(times)))
+    channels = [Channel("x", "m/s^2", 0.01, csv="x")]
+    recording = open_recording(path, channels, start=start)
+    found = np.concatenate([block.time for block in recording.blocks()])
+    np.testing.assert_allclose(found[[0, 199]] - start, [0, 1.99e9], atol=1000)
+    np.testing.assert_allclose(found[200:] / 1e9, times[200:], atol=1e-6)
