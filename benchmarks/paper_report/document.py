@@ -40,7 +40,10 @@ def read_rows(folder: Path) -> Rows:
 
 
 def _all_rows(folder: Path) -> Rows:
-    found = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob("*.json"))]
+    rows = folder / "rows"
+    if not rows.is_dir():
+        raise ValueError(f"{rows}: no such folder; `sprung bench paper` makes one")
+    found = [json.loads(path.read_text()) for path in sorted(rows.glob("*.json"))]
     return [row for row in found if "unfinished" not in row]
 
 
@@ -60,6 +63,7 @@ def refresh(folder: Path, document: Path, only: list[str] | None = None) -> list
     found = [row for row in found if not of_other_code[row["task"]]]
     if not found:
         read_rows(folder)
+        raise ValueError(f"{folder / 'rows'}: no rows of a run that ended")
     filled: list[dict[str, Any]] = []
 
     def fill(match: re.Match[str]) -> str:

@@ -241,3 +241,14 @@ def test_tables_of_the_page_are_those_of_the_kept_rows(tmp_path: Path, monkeypat
     copy.write_text(page.read_text())
     told = list(paper_report.run(None, copy))
     assert len(told) > 10 and [row["place"] for row in told if row["changed"]] == []
+
+
+@pytest.mark.parametrize("made", [(), ("rows",)], ids=["no folder", "no rows"])
+def test_a_folder_without_rows_is_refused(tmp_path: Path, made: tuple[str, ...]) -> None:
+    document = tmp_path / "paper.md"
+    document.write_text("<!-- targets -->\nkept\n<!-- end -->\n")
+    for name in made:
+        (tmp_path / name).mkdir()
+    with pytest.raises(UserError, match="rows: no"):
+        list(paper_report.run(tmp_path, document))
+    assert "kept" in document.read_text()
