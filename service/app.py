@@ -93,6 +93,7 @@ def create_app(
         openapi_url=None,  # `docs` answers it, with the checks of every other route
         docs_url=None,  # both load scripts from other hosts; `docs` draws a page of its own
         redoc_url=None,
+        redirect_slashes=False,  # to an address made of the Host header, whatever that says
     )
     app.state.core = core
     problems.install(app)

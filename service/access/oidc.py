@@ -148,7 +148,7 @@ class Provider:
             raise Refused(f"{name} is in no group that may do anything here")
         # scopes of one fleet never count for another: the first group in the settings decides which fleet it is
         scopes = frozenset[str]().union(*(grant.scopes for grant in held if grant.fleet == held[0].fleet))
-        return Actor(f"oidc:{name}", scopes, held[0].fleet)
+        return Actor(f"oidc:{name}", scopes, held[0].fleet, f"oidc:{claims['sub']}")
 
     def _claims(self, token: str, audience: str) -> dict[str, Any]:
         import jwt

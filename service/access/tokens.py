@@ -43,6 +43,7 @@ class Actor:
     name: str = "local"
     scopes: frozenset[str] = frozenset(SCOPES)
     fleet: str = ""  # vehicles whose ids begin so; empty: all
+    key: str = ""  # of the token or person, for limits of one client: names are chosen, and may be those of others
 
     def may(self, scope: str) -> bool:
         """Whether a scope allows it, by itself or as part of a greater one."""
@@ -63,7 +64,7 @@ class _Session:
 
     ends: float  # time.monotonic()
     owner: Callable[[], Actor]
-    name: str
+    key: str  # of whose it is
 
 
 class Tokens:
@@ -156,7 +157,7 @@ class Tokens:
         """Who a token belongs to.  Raises Refused."""
         digest = digest_of(text)
         if self._admin is not None and hmac.compare_digest(digest, self._admin):
-            return Actor("admin", frozenset({"admin"}))
+            return Actor("admin", frozenset({"admin"}), key="admin")
         parts = text.split("_", 2)
         row = self._row(parts[1]) if len(parts) == 3 and parts[0] == PREFIX and len(parts[1]) == 12 else None
         if row is None or not hmac.compare_digest(digest, row.digest):
@@ -166,19 +167,19 @@ class Tokens:
     def sign_in(self, text: str) -> tuple[str, Actor]:
         """A session of the token's owner, that ends with the token, and who that is.  Raises Refused."""
         actor = self.actor(text)
-        return self.open_session(lambda: self.actor(text), SESSION_SECONDS, actor.name), actor
+        return self.open_session(lambda: self.actor(text), SESSION_SECONDS, actor.key), actor
 
-    def open_session(self, owner: Callable[[], Actor], seconds: float, name: str) -> str:
+    def open_session(self, owner: Callable[[], Actor], seconds: float, key: str) -> str:
         """A session; `owner` is asked with each request and may raise Refused.
 
-        When there are too many, who has most of them by `name` loses the oldest: nobody signs others out.
+        When there are too many, who has most of them by `key` loses the oldest: nobody signs others out.
         """
         session = secrets.token_urlsafe(32)
         with self._lock:
-            self._sessions[digest_of(session)] = _Session(time.monotonic() + seconds, owner, name)
+            self._sessions[digest_of(session)] = _Session(time.monotonic() + seconds, owner, key)
             if len(self._sessions) > MOST_SESSIONS:
-                greedy = Counter(one.name for one in self._sessions.values()).most_common(1)[0][0]
-                del self._sessions[next(key for key, one in self._sessions.items() if one.name == greedy)]
+                greedy = Counter(one.key for one in self._sessions.values()).most_common(1)[0][0]
+                del self._sessions[next(digest for digest, one in self._sessions.items() if one.key == greedy)]
         return session
 
     def sign_out(self, session: str) -> Actor | None:
@@ -202,7 +203,7 @@ class Tokens:
     def _valid(self, row: TokenRow) -> Actor:
         if (wrong := _worthless(row, self._clock())) is not None:
             raise Refused(f"the token {wrong}")
-        return Actor(row.name, frozenset(row.scopes), row.fleet)
+        return Actor(row.name, frozenset(row.scopes), row.fleet, row.id)
 
     def _row(self, token_id: str) -> TokenRow | None:
         with self._lock, suppress(KeyError):

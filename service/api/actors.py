@@ -21,10 +21,10 @@ ActorOf = Annotated[Actor, Depends(get_actor)]
 
 
 async def get_client(request: Request, actor: ActorOf) -> str:
-    """Identity for per-client limits: the token's owner, or the address without authentication."""
+    """Identity for per-client limits: the token or person, or the address without authentication."""
     if actor == Actor():
         return f"address {client_of(request.client.host if request.client else '')}"
-    return f"token {actor.name}"
+    return f"token {actor.key}"
 
 
 ClientOf = Annotated[str, Depends(get_client)]

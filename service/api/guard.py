@@ -41,6 +41,7 @@ BURST_SECONDS = 2.0  # of the permitted rate that may come at once
 MOST_CLIENTS = 10_000
 MOST_HEADERS, MOST_HEADER_BYTES = 100, 32_000  # of one request: browsers send twenty, and cookies of 4 kB at most
 MOST_TARGET_BYTES = 16_000  # of path and query
+SPOKEN = re.compile(r"1\.\d|[23]")  # versions of HTTP, as servers name them
 
 LOCAL, NOBODY = Actor(), Actor("nobody", frozenset())
 
@@ -127,6 +128,8 @@ class Guard:
         path = scope["path"]
         try:
             need = need_of(scope["method"], path)
+            if not SPOKEN.fullmatch(scope.get("http_version", "1.1")):
+                raise ApiProblem(505, "requests are taken in HTTP/1.1", headers=CLOSE)
             if len(scope["headers"]) > MOST_HEADERS or sum(map(_length, scope["headers"])) > MOST_HEADER_BYTES:
                 raise ApiProblem(431, f"more than {MOST_HEADERS} headers, or {MOST_HEADER_BYTES // 1000} kB of them")
             if len(scope.get("raw_path") or b"") + len(scope["query_string"]) > MOST_TARGET_BYTES:
@@ -182,7 +185,7 @@ class Guard:
         if not self._good.pop(credential, False):
             self._limiter.give(address)
         self._good[credential] = True
-        self._limiter.take(f"token {actor.name}")
+        self._limiter.take(f"token {actor.key}")
         return actor, by_cookie
 
     async def _foreign(self, headers: Headers) -> tuple[Actor, bool] | None:

@@ -87,7 +87,7 @@ async def signed_in_elsewhere(request: Request, core: CoreOf) -> Response:
     except Unreachable as failed:
         return _unreachable(core, "/", failed)
     seconds = 3600 * core.settings.oidc_session_hours
-    session = core.tokens.open_session(lambda: actor, seconds, actor.name)
+    session = core.tokens.open_session(lambda: actor, seconds, actor.key)
     await note(core, actor, "sign in", actor.name)
     # a page that goes on, no redirection: browsers send the session's strict cookie with what this site begins
     response = HTMLResponse(render("onward.html", to=to))

@@ -444,6 +444,22 @@ def test_a_token_that_was_good_is_taken_beside_others_that_are_not(engine: Engin
     assert found[0] == found[-1] == 200 and found[-2] == 429
 
 
+def test_tokens_of_the_same_name_are_counted_apart(strict: Core) -> None:
+    first, _ = strict.tokens.create("feeder", ["read"])
+    second, _ = strict.tokens.create("feeder", ["read"])
+    found = statuses(strict, *[("a", "/vehicles", first)] * 3, ("b", "/vehicles", second))
+    assert found[0] == 200 and found[2] == 429 and found[3] == 200
+
+
+def test_sessions_of_others_with_the_same_name_are_not_ended(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sprung.service.access.tokens.MOST_SESSIONS", 3)
+    mine, greedy = (core.tokens.create("anna", ["read"])[0] for _ in range(2))
+    session, _ = core.tokens.sign_in(mine)
+    for _ in range(5):
+        core.tokens.sign_in(greedy)
+    assert core.tokens.session(session).name == "anna"
+
+
 def test_deeds_are_written_down(client: TestClient, core: Core) -> None:
     text, _ = core.tokens.create("anna", ["admin"])
     job = client.post("/recordings", files={"file": ("a.mcap", b"x")}, headers=bearer(text)).json()["id"]

@@ -243,6 +243,12 @@ def test_a_provider_that_drips_is_hung_up_on(
         dripping.join()
 
 
+def test_people_who_choose_the_same_name_are_counted_apart(provider: FakeProvider, tmp_path: Path) -> None:
+    taken = Provider(provider_settings(provider, tmp_path))
+    one, other = (taken.actor(provider.token(sub=sub, preferred_username="anna")) for sub in ("7", "8"))
+    assert one.name == other.name and one.key != other.key
+
+
 def test_names_that_people_choose_cannot_deceive(provider: FakeProvider, tmp_path: Path) -> None:
     taken = Provider(provider_settings(provider, tmp_path))
     name = taken.actor(provider.token(preferred_username="anna\x1b[31m\u202e\n2026 admin")).name

@@ -84,6 +84,28 @@ def test_what_is_no_http_is_answered_as_every_error(engine: Engine, tmp_path: Pa
     assert json.loads(body)["status"] == 400
 
 
+@pytest.mark.parametrize("version", ["0.9", "2.0", "3.0", "9.9", "1.0", "1.1", "1.9"])
+def test_only_requests_in_a_version_that_is_spoken_here_are_answered(
+    engine: Engine, tmp_path: Path, version: str
+) -> None:
+    with (
+        served(build_core(settings(tmp_path), engine)) as port,
+        socket.create_connection(("127.0.0.1", port), timeout=10) as line,
+    ):
+        line.sendall(f"GET /health/live HTTP/{version}\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
+        answer = b""
+        while piece := line.recv(65536):
+            answer += piece
+    assert answer.startswith(b"HTTP/1.1 200 " if version[0] == "1" else b"HTTP/1.1 505 ")
+
+
+@pytest.mark.parametrize("path", ["/vehicles/", "/signin/", "/identify/", "/static", "/vehicles//"])
+def test_nobody_is_sent_to_the_host_that_he_names(client: TestClient, path: str) -> None:
+    for method in ("GET", "POST"):
+        answer = client.request(method, path, headers={"Host": "evil.localhost"}, follow_redirects=False)
+        assert answer.status_code in (404, 405) and "location" not in answer.headers
+
+
 @pytest.mark.parametrize("more", [b"Content-Length: 5\r\n", b""], ids=["refused at once", "read to its end"])
 def test_a_body_that_goes_wrong_on_its_way_is_answered_once_and_logged_as_no_mistake_of_the_service(
     engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture, more: bytes
