@@ -7,6 +7,7 @@ left out.  Everything is counted and reported per channel.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -40,6 +41,8 @@ RANGES = {  # of channels of rail vehicles if the system file states none; far b
 ANYTHING = (-1e12, 1e12)  # in other units
 AMBIGUOUS = ("N", "Pa", "kg")  # units in which a sentinel may be an ordinary value, as it may in counts
 FEWEST_ZEROS = 3  # of a channel: one may be chance
+MOST_MARKS = 100  # values of a channel that are looked at as marks of a missing value
+MARK_APART = 10.0  # mean steps from one sample to the next by which both neighbours of such a value must lie off it
 ZERO_APART = 6.0  # usual steps from one sample to the next by which both neighbours of a single 0 must lie off it
 STANDS_OUT = 10.0  # median deviations of the other values by which a sentinel must then lie outside them
 
@@ -70,6 +73,7 @@ class PlausibilityCheck:
         self._late = 0  # samples without a possible time
         self._twice = np.zeros(len(channels), dtype=np.int64)  # samples that are there twice
         self._zeros = np.zeros(len(channels), dtype=np.int64)  # single values of 0 where they should not be
+        self._marks = [Counter[float]() for _ in channels]  # values that came alone and far from their neighbours
         self._first: dict[str, int] = {}  # time of the first of either kind, ns
         self._begun: int | None = None  # ns, the first time
 
@@ -110,9 +114,9 @@ class PlausibilityCheck:
         return found
 
     def _repeated(self, block: SampleBlock) -> None:
-        """Count what would pass in silence: copies of a sample, and zeros that stand for a missing value.
+        """Count what would pass in silence: copies of a sample, and values that may stand for a missing one.
 
-        Neither is changed: a copy says nothing new, and a 0 may be one.
+        Nothing is changed: a copy says nothing new, a 0 may be one, and a shock may reach the end of an instrument.
         """
         if not len(block.time):
             return
@@ -134,6 +138,23 @@ class PlausibilityCheck:
             off = np.minimum(np.abs(value[own - 1]), np.abs(value[own + 1])) > ZERO_APART * usual
             self._count("zero", self._zeros, channel[own][off], time[own][off])
 
+        self._marked(channel, value, same)
+
+    def _marked(self, channel: NDArray[np.int32], value: FloatArray, same: BoolArray) -> None:
+        """Count values (n,), ordered by channel, that lie alone and far from both neighbours.
+
+        same: (n - 1,), whether a value and the next one are of the same channel.
+        """
+        step = np.where(same, np.abs(np.diff(value)), np.nan)
+        taken = np.isfinite(step)
+        sums, counts = (np.bincount(channel[1:][taken], some[taken], len(self._bad)) for some in (step, same))
+        far = step > MARK_APART * (sums / np.maximum(counts, 1.0))[channel[1:]]
+        alone = (value[1:-1] - value[:-2]) * (value[1:-1] - value[2:]) > 0.0
+        for at in (np.flatnonzero(far[1:] & far[:-1] & alone & (value[1:-1] != 0.0)) + 1)[:MOST_MARKS].tolist():
+            marks, mark = self._marks[channel[at]], float(value[at])
+            if mark in marks or len(marks) < MOST_MARKS:
+                marks[mark] += 1
+
     def _count(self, kind: str, counts: IntArray, channel: NDArray[np.int32], time: IntArray) -> None:
         if len(time):
             counts += np.bincount(channel, minlength=len(counts))
@@ -152,6 +173,12 @@ class PlausibilityCheck:
         """At the end of the recording."""
         self._note("twice", self._twice, 1, "samples that are there twice")
         self._note("zero", self._zeros, FEWEST_ZEROS, "single values of 0 between others far from it")
+        for channel, marks in zip(self._channels, self._marks, strict=True):
+            for mark, count in marks.most_common(3):
+                if count >= FEWEST_ZEROS and mark not in SENTINELS:
+                    self._account.note(
+                        f"{channel.name}: {count} single values of {mark:.6g} between others far from it"
+                    )
         if self._late:
             self._account.problem(f"{self._late} samples left out: their time stamps are such as no clock shows")
         for index in np.flatnonzero(self._bad).tolist():

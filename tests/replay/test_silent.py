@@ -46,6 +46,20 @@ def test_zeros_that_stand_for_missing_values_are_reported(tmp_path: Path) -> Non
     assert told == ["single values of 0 between others far from it: 3, the first after 3.00 s (right)"]
 
 
+@pytest.mark.parametrize("mark", [-99.99, 4095.0, 255.0, -1000.0])
+def test_a_value_that_comes_again_and_again_far_from_all_others_is_reported(tmp_path: Path, mark: float) -> None:
+    wrong = NOISE.copy()
+    wrong[[300, 500, 900, 1500]] = mark
+    told = table(tmp_path / "a.csv", SECONDS, wrong, LEVEL)
+    assert told == [f"left: 4 single values of {mark:g} between others far from it"]
+
+
+def test_shocks_are_not_taken_for_marks(tmp_path: Path) -> None:
+    shocks = NOISE.copy()
+    shocks[[300, 500, 900, 1500]] = [80.0, -95.5, 101.25, 60.0]
+    assert table(tmp_path / "a.csv", SECONDS, shocks, LEVEL) == []
+
+
 def test_a_clock_that_leaps_ahead_and_a_pause_are_reported(tmp_path: Path) -> None:
     told = table(tmp_path / "a.csv", SECONDS + 5.5 * (SECONDS > 10), NOISE, LEVEL)
     assert told == ["nothing for more than 5 s, once: 5.51 s until 2026-09-21T14:13:35Z"]
