@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -278,12 +278,15 @@ class System:
     def loads(self) -> tuple[LoadState, ...]:
         """Bodies that carry passengers or goods: those with `load`; else those that support no other body.
 
-        A mass that is estimated, or fixed, is no load.
+        A mass that is estimated, or fixed, is no load; nor is one without `load` that is only seen in proportion to
+        the springs at it.
         """
         declared = [name for name, body in self.file.bodies.items() if body.load is not None]
         carrying = {element.lower for element in self.file.elements.values()}
         estimated = {p.element for p in self.parameters if p.quantity == "mass"}
         free = [name for name in self.bodies if name not in carrying and not self.file.bodies[name].mass.fixed]
+        unscaled = without_scale(self.file, free)
+        free = [name for name in free if name not in unscaled]
         return tuple(self._load(name, name in declared) for name in declared or free if name not in estimated)
 
     def _load(self, name: str, declared: bool) -> LoadState:
@@ -429,6 +432,24 @@ def _unseen(mode: Mode) -> str:
     )
 
 
+def without_scale(file: SystemFile, loads: Collection[str]) -> frozenset[str]:
+    """Those of `loads` whose mass is only seen in proportion to springs and dampers: of what they are joined to, every
+    mass is a load as well, nothing is known, and no force is measured."""
+    forces = any(isinstance(source, ForceInput) for source in file.inputs.values())
+    if forces or any(sensor.kind == "force" for sensor in file.sensors.values()):
+        return frozenset()
+    group = {name: {name} for name in file.bodies}
+    scaled = set(file.bodies) - set(loads)
+    for element in file.elements.values():
+        ends = [end for end in (element.upper, element.lower) if end in group]
+        joined = set().union(*(group[end] for end in ends))
+        group |= {name: joined for name in joined}
+        values = (("stiffness", element.stiffness), ("damping", element.damping))
+        if any(v.value > 0 and (v.fixed or quantity not in file.estimate) for quantity, v in values):
+            scaled.update(ends)
+    return frozenset(name for name in loads if not group[name] & scaled)
+
+
 def unsupported(file: SystemFile) -> list[str]:
     """Contents of a file that identification does not support, one line each."""
     found = []
@@ -444,6 +465,13 @@ def unsupported(file: SystemFile) -> list[str]:
     for name in follows:
         if file.elements[name].upper not in file.bodies:
             found.append(f"elements.{name}.by_load: its upper end must be the body that is loaded")
+    declared = [name for name, body in file.bodies.items() if body.load is not None]
+    if not tracks and file.inputs:
+        for name in sorted(without_scale(file, declared)):
+            found.append(
+                f"bodies.{name}.load: its mass is only seen in proportion to the springs and dampers, since no other "
+                "mass, stiffness or force is known; leave load out (or add a force sensor)"
+            )
     seconds = file.window / file.sample_rate
     if tracks and seconds < SHORTEST_TRACK:
         least = round(SHORTEST_TRACK * file.sample_rate)

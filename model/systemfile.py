@@ -236,7 +236,8 @@ def _words(detail: ErrorDetails, keys: list[str]) -> str:
         case "missing":
             return "this key is missing"
         case "extra_forbidden":
-            return f"unknown key{did_you_mean(keys[-1], _all_keys())}"
+            known = _all_keys()
+            return "this key has no place here" if keys[-1] in known else f"unknown key{did_you_mean(keys[-1], known)}"
         case "union_tag_not_found":
             return "kind: this key is missing"
         case "union_tag_invalid":

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.identification.identify import Identifier
 from sprung.model.schema import SI, SystemFileError
 from sprung.model.system import System, load_system, parse_system
 from sprung.model.systemfile import json_schema, parse_system_file
@@ -189,6 +191,64 @@ def test_track_load_speed_and_tests_without_a_body_can_be_said() -> None:
         " elements: {damper: {upper: rod, lower: ground, damping: 100.0}},"
         " sensors: {cell: {kind: force, element: damper, csv: F}}, estimate: [damping]}"
     )
+
+
+SINGLE = """
+name: machine
+sample_rate: 100
+window: 200
+bodies: {machine: {mass: 1000}}
+inputs: {floor: {kind: support, acceleration: {csv: f, noise: 0.01}}}
+elements: {mount: {upper: machine, lower: floor, stiffness: 4.0e+5, damping: 4000}}
+sensors: {top: {kind: acceleration, body: machine, csv: a, noise: 0.01}}
+"""
+
+
+def test_a_mass_that_is_only_seen_in_proportion_to_the_springs_is_no_load() -> None:
+    assert parse_system(SINGLE).loads == ()
+    with pytest.raises(SystemFileError, match=r"bodies\.machine\.load: its mass is only seen in proportion"):
+        parse_system(SINGLE.replace("mass: 1000", "mass: 1000, load: true"))
+    for known in (
+        SINGLE.replace("damping: 4000", "damping: {value: 4000, fixed: true}"),
+        SINGLE.replace("sensors: {", "sensors: {cell: {kind: force, element: mount, csv: F}, "),
+        SINGLE + "estimate: [stiffness]\n",
+        SINGLE.replace("{machine: {mass: 1000}}", "{machine: {mass: 1000}, frame: {mass: 90}}").replace(
+            "elements: {", "elements: {foot: {upper: frame, lower: floor, stiffness: 1.0e+6, damping: 900}, "
+        ).replace("lower: floor, stiffness: 4", "lower: frame, stiffness: 4"),
+    ):  # fmt: skip
+        assert [load.body for load in parse_system(known).loads] == ["machine"]
+    two = SINGLE.replace("{machine: {mass: 1000}}", "{machine: {mass: 1000}, other: {mass: 90}}")
+    two = two.replace("elements: {", "elements: {foot: {upper: other, lower: floor, stiffness: 1.0e+6, damping: 900}, ")
+    two = two.replace("sensors: {", "sensors: {there: {kind: acceleration, body: other, csv: b}, ")
+    assert parse_system(two).loads == ()  # beside each other, neither says how heavy the other is
+
+
+def test_a_single_body_on_measured_supports_is_tracked() -> None:
+    system, rng = parse_system(SINGLE), np.random.default_rng(3)
+    values = simulate_runs(system, np.tile([0.05, -0.1], (8, 1)), system.window, rng).values
+    found = Identifier(system).examine(values, np.ones(len(values), dtype=bool))
+    assert all(one.informative and one.identifiable.all() for one in found)
+    errors = np.array([(one.log_ratio - [0.05, -0.1]) / np.sqrt(one.covariance.diagonal()) for one in found])
+    assert np.abs(errors).max() < 4.0
+
+
+def test_windows_with_inputs_alone_are_not_identified_also_where_inputs_are_lost() -> None:
+    text = SINGLE.replace("inputs: {", "inputs: {wall: {kind: support, velocity: {csv: w, noise: 0.001}}, ")
+    text = text.replace(
+        "elements: {", "elements: {arm: {upper: machine, lower: wall, stiffness: 1.0e+5, damping: 900}, "
+    )
+    system, rng = parse_system(text), np.random.default_rng(3)
+    values = simulate_runs(system, np.zeros((3, 4)), system.window, rng).values
+    values[0, :, 2] = np.nan
+    values[1, :, 1:] = np.nan
+    for found in (Identifier(system).examine(values, np.ones(3, dtype=bool)), Identifier(system).identify(values)):
+        assert [one.identified for one in found] == [False, False, True]
+        assert found[1].reason == "missing sensor top"
+
+
+def test_a_key_that_belongs_elsewhere_is_not_proposed() -> None:
+    with pytest.raises(SystemFileError, match=r"inputs\.floor\.position: this key has no place here"):
+        parse_system(SINGLE.replace("kind: support", "kind: support, position: [0, 0]"))
 
 
 BROKEN = """

@@ -188,7 +188,7 @@ temperature: {csv: T, unit: K}
 yaw_rate: {csv: turn, unit: deg/s}
 bodies: {car: {mass: 1000, load: {min: 0, max: 300, pressure: {csv: p, unit: bar}}}}
 inputs: {road: {kind: displacement, displacement: {csv: road}}}
-elements: {spring: {upper: car, lower: road, stiffness: 40000, damping: 2000}}
+elements: {spring: {upper: car, lower: road, stiffness: 40000, damping: {value: 2000, fixed: true}}}
 sensors: {a: {kind: acceleration, body: car, csv: a}}
 """
 
