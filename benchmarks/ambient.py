@@ -154,9 +154,9 @@ def isolation(cases: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]
 def size_bound(vehicle: Vehicle, rng: np.random.Generator, values: Array, hit: int, seconds: float) -> float:
     """Standard deviation of what is left of a value that no unbiased estimator can beat, from `MINUTES` rides such as
     those of a verdict, where it is known which value has changed and the others lie within their scatter."""
-    information = np.full(len(values), SCATTER**-2.0)
-    information[hit] = 0.0
-    whole = np.diag(information)
+    known = _changed(hit)
+    known[hit] = 0.0
+    whole = np.diag(known)
     for _ in range(MINUTES):
         ride = replace(draw_ride(rng), log_ratio=values)
         whole += np.linalg.inv(bound_covariance(vehicle, ride, TWO, seconds)[:24, :24])
@@ -164,30 +164,49 @@ def size_bound(vehicle: Vehicle, rng: np.random.Generator, values: Array, hit: i
 
 
 def verdict(rng: np.random.Generator, values: Array, seconds: float) -> tuple[int, float]:
-    """Which of the 24 values has changed, and what of its nominal value is left."""
+    """Which of the 24 values has changed, and what of its nominal value is left.
+
+    Windows are fitted with all values open; what is left is then fitted once more with only the changed one open, as
+    what windows say is linear near their fit alone.
+    """
     identifier = AmbientIdentifier(load_system(BUNDLED / "accelerometers.yaml"))
-    identifier.window.prior_std[:24] = LOOSE
-    information, pull = np.zeros((24, 24)), np.zeros(24)
+    windows = []
     for _ in range(MINUTES):
         ride = replace(draw_ride(rng), log_ratio=values)
-        seen = np.full((round(seconds * SAMPLE_RATE), 12), np.nan)
-        seen[:, TWO] = record(rng, ride, seconds)[:, TWO]
-        fit = identifier.fit(seen)
-        if fit is None:
-            continue
-        precision = np.linalg.inv(fit.covariance[:24, :24])
-        information += precision - np.eye(24) / LOOSE**2
-        pull += precision @ fit.log_ratio[:24]
-    evidence, size = [], []
+        windows.append(np.full((round(seconds * SAMPLE_RATE), 12), np.nan))
+        windows[-1][:, TWO] = record(rng, ride, seconds)[:, TWO]
+    information, pull = _together(identifier, windows, np.full(24, LOOSE), np.zeros(24))
+    evidence = []
     for i in range(24):
-        prior = np.full(24, SCATTER**-2.0)
-        prior[i] = 1.0
-        together = information + np.diag(prior)
-        mean = np.linalg.solve(together, pull)
-        evidence.append(0.5 * (pull @ mean - np.linalg.slogdet(together)[1] + np.log(prior).sum()))
-        size.append(np.exp(mean[i]))
+        prior = _changed(i)
+        whole = information + np.diag(prior)
+        mean = np.linalg.solve(whole, pull)
+        evidence.append(0.5 * (pull @ mean - np.linalg.slogdet(whole)[1] + np.log(prior).sum()))
     best = int(np.argmax(evidence))
-    return best, float(size[best])
+    prior = _changed(best)
+    mean = np.linalg.solve(information + np.diag(prior), pull)
+    information, pull = _together(identifier, windows, np.sqrt(1 / prior), mean)
+    return best, float(np.exp(np.linalg.solve(information + np.diag(prior), pull)[best]))
+
+
+def _changed(hit: int) -> Array:
+    """Precision of the 24 log-ratios where one has changed and the others have not."""
+    prior = np.full(24, SCATTER**-2.0)
+    prior[hit] = 1.0
+    return prior
+
+
+def _together(identifier: AmbientIdentifier, windows: list[Array], std: Array, start: Array) -> tuple[Array, Array]:
+    """Information of windows on the 24 log-ratios, and that times their mean, beyond the prior `std` of each fit."""
+    identifier.window.prior_std[:24] = std
+    information, pull = np.zeros((24, 24)), np.zeros(24)
+    for values in windows:
+        fit = identifier.fit(values, start if start.any() else None)
+        if fit is not None:
+            precision = np.linalg.inv(fit.covariance[:24, :24])
+            information += precision - np.diag(std**-2.0)
+            pull += precision @ fit.log_ratio[:24]
+    return information, pull
 
 
 def bound(vehicle: Vehicle, ride: DrawnRide, sensors: list[int], seconds: float) -> Array:

@@ -409,6 +409,7 @@ def _with_laws(system: System, workers: int, seconds: float) -> Identifies:
 def identifiability(system: System, seed: int = 0) -> FloatArray:
     """Standard deviation of each log-ratio that one simulated window gives at the nominal values, shape (P,).
 
+    Loads that the file names are as unknown as they are to `Identifier.identify`.
     The median over 16 windows of running on an average track; `PRIOR_STD` where a window is uninformative.  Without
     measured inputs what the spectra of an unmeasured track, or of ambient forces, determine.
     """
@@ -418,8 +419,9 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
         return foreseen(system)
     truth = np.zeros((16, len(system.parameters)))
     runs = simulate_runs(system, truth, system.window, np.random.default_rng(seed))
-    refined = Refiner(system).refine(runs.values, truth)
-    std = np.sqrt(np.diagonal(refined.covariance, axis1=1, axis2=2))
+    loads = any(load.declared for load in system.loads)
+    refined = Refiner(system).refine(runs.values, truth, loads=loads)
+    std = np.sqrt(np.diagonal(refined.covariance, axis1=1, axis2=2))[:, : truth.shape[1]]
     found: FloatArray = np.minimum(np.median(std, axis=0), PRIOR_STD)
     return found
 

@@ -11,7 +11,7 @@ from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import FloatArray
-from sprung.model.system import System, load_system, parse_system
+from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from tests.test_system import OSCILLATOR, QUARTER_CAR
 
 
@@ -227,6 +227,17 @@ sensors:
   a2: {kind: acceleration, body: second, csv: a2, noise: 0.01}
 """)
     assert np.all(identifiability(system) < 0.05)
+
+
+def test_identifiability_is_that_beside_an_unknown_load_where_the_file_names_one() -> None:
+    """A window's own bound: about twice the deviation of the springs at the body, of the others nothing."""
+    text = MANCHESTER.read_text()
+    place = "position: [0.0, 0.0]}"
+    known, loaded = (
+        identifiability(parse_system(one)) for one in (text, text.replace(place, f"{place[:-1]}, load: true}}", 1))
+    )
+    assert np.all(loaded[8:12] > 1.4 * known[8:12])
+    assert np.allclose(loaded[:8], known[:8], rtol=0.1)
 
 
 def test_identifiability_names_what_a_window_does_not_determine() -> None:
