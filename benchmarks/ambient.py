@@ -185,7 +185,7 @@ def verdict(rng: np.random.Generator, values: Array, seconds: float) -> tuple[in
     best = int(np.argmax(evidence))
     prior = _changed(best)
     mean = np.linalg.solve(information + np.diag(prior), pull)
-    information, pull = _together(identifier, windows, np.sqrt(1 / prior), mean)
+    information, pull = _together(identifier, windows, np.asarray(prior**-0.5, dtype=np.float64), mean)
     return best, float(np.exp(np.linalg.solve(information + np.diag(prior), pull)[best]))
 
 
