@@ -184,8 +184,8 @@ def verdict(rng: np.random.Generator, values: Array, seconds: float) -> tuple[in
         evidence.append(0.5 * (pull @ mean - np.linalg.slogdet(whole)[1] + np.log(prior).sum()))
     best = int(np.argmax(evidence))
     prior = _changed(best)
-    mean = np.linalg.solve(information + np.diag(prior), pull)
-    information, pull = _together(identifier, windows, np.asarray(prior**-0.5, dtype=np.float64), mean)
+    near = np.asarray(np.linalg.solve(information + np.diag(prior), pull), dtype=np.float64)
+    information, pull = _together(identifier, windows, prior**-0.5, near)
     return best, float(np.exp(np.linalg.solve(information + np.diag(prior), pull)[best]))
 
 
