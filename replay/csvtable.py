@@ -60,8 +60,10 @@ def read_layout(path: Path) -> tuple[TableLayout, Head]:
     head = Head(path)
     layout = sniff(head.lines)
     if layout is None:
-        begins = f"begins with {' '.join(head.lines[0].split())[:60]!r}" if head.lines else "is empty"
-        raise UnreadableRecording(f"{path}: no rows of numbers in its first lines; it {begins}")
+        begins = f"it begins with {' '.join(head.lines[0].split())[:60]!r}" if head.lines else "it is empty"
+        if not head.lines and path.stat().st_size:
+            begins = f"the first one is longer than {CHUNK >> 20} MB"
+        raise UnreadableRecording(f"{path}: no rows of numbers in its first lines; {begins}")
     return layout, head
 
 

@@ -294,3 +294,10 @@ def test_columns_are_called_as_channels_where_the_system_file_names_none(tmp_pat
     np.testing.assert_allclose(values, VALUES, atol=1e-9)
     with pytest.raises(UnreadableRecording, match="names no columns"):
         read(path, (Channel("y", "m", 1e-6), Channel("G", "N", 1.0)))
+
+
+@pytest.mark.parametrize(("text", "told"), [("", "it is empty"), ("1," * 600_000, "the first one is longer than 1 MB")])
+def test_a_table_without_rows_says_why(tmp_path: Path, text: str, told: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(UnreadableRecording, match=told):
+        read(tmp_path / "a.csv")
