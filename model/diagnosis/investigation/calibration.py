@@ -8,7 +8,8 @@ tolerances as prior (`gain_std`, `offset_std`, `delay_std` of an address), and t
 tolerance are reported and have no effect on the verdict; their uncertainty is part of that of all other values.
 
 With enough channels, one whose error is far larger than all others of its kind is a fault, however small: the
-instruments of one rig are comparable.
+instruments of one rig are comparable.  Where laws are missing, errors make up for them: such a fault is told only if
+the model leaves no more than noise.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from scipy.special import ndtr, stdtr
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.floor import leaves_more_than_noise
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.response.terms import Term
@@ -196,7 +198,9 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
             problem, fit = refreshed(problem, fit)
         fitted = _with_heavy_tails(fit, range(len(file), len(file) + len(terms)))
         fitted = fitted if _anchored(state, fitted) else centred(fitted)
-        if is_outlier(fit, fitted, first.key, state.options.rules.plausible):
+        alone = is_outlier(fit, fitted, first.key, state.options.rules.plausible)
+        with_them = replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise))
+        if alone and not leaves_more_than_noise(with_them):
             return replace(state, calibrations=0)
         if any(out_of_range(term) for term in fitted):
             return replace(state, calibrations=0)  # no errors, but another structure
@@ -283,10 +287,18 @@ def without_calibrations(state: Investigation) -> Screening:
 
 
 def faulty(state: Investigation) -> list[int]:
-    """Indices of calibration errors that are significantly beyond their tolerance beside all findings."""
+    """Indices of calibration errors that are significantly beyond their tolerance beside all findings, or outliers."""
     fit, rules = state.fit, state.options.rules.plausible
     beyond = (index for index in calibration_indices(state) if not within_tolerance(state, fit.point.terms[index]))
-    return [index for index in beyond if not hardly_there(fit, rules, index)]
+    return sorted({*(index for index in beyond if not hardly_there(fit, rules, index)), *_outliers(state)})
+
+
+def _outliers(state: Investigation) -> list[int]:
+    """Indices of calibration errors that are outliers of their kind beside all findings."""
+    free = [index for index in calibration_indices(state) if not state.fit.point.terms[index].fixed]
+    terms, rules = [state.fit.point.terms[index] for index in free], state.options.rules.plausible
+    alone = [index for index in free if is_outlier(state.fit, terms, state.fit.point.terms[index].key, rules)]
+    return alone if alone and not leaves_more_than_noise(state) else []
 
 
 def _is_observable(law: SensorLaw, *, rate: bool, support: bool) -> bool:

@@ -12,11 +12,11 @@ from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.along_motion import with_laws_along_motion
 from sprung.model.diagnosis.investigation.common_delay import common_delay
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
+from sprung.model.diagnosis.investigation.floor import leaves_more_than_noise
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import (
     another_structure,
     judged,
-    leaves_more_than_noise,
     unmeasured_share,
 )
 from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covariance

@@ -8,14 +8,13 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.calibration import faulty, within_tolerance
-from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
+from sprung.model.diagnosis.investigation.floor import bounded, realised_floor
 from sprung.model.diagnosis.investigation.setup_effects import WRONG_BODY
 from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
-from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, bounded_noise, kind_of, verdict_of
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
 from sprung.model.diagnosis.kinds import EffectKind
-from sprung.model.diagnosis.record.signals import Noise, declared_noise
+from sprung.model.diagnosis.record.signals import Noise
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.laws import Law
@@ -99,16 +98,6 @@ def _kind(state: Investigation, term: Term, law: Law) -> EffectKind:
     return EffectKind.NUISANCE if within_tolerance(state, term) else kind_of(law)
 
 
-def leaves_more_than_noise(state: Investigation) -> bool:
-    """Whether the findings so far leave an unexplained share."""
-    run = state.held.run(state.fit.point)
-    size = np.sqrt(np.mean(run.measured**2, axis=0))
-    expected = state.held.noise_rms(state.fit, bounded(state)) / np.where(size > 0, size, 1.0)
-    rules = state.options.rules.verdict
-    errors = HeldOutErrors(run.per_sensor, run.per_sensor, realised_floor(expected, run, rules))
-    return bool(np.any(errors.unexplained(rules) > 0))
-
-
 def changed_parts(state: Investigation) -> int:
     """Number of structural changes among the findings: moved elements and linear parts."""
     moved = sum(fault.effect is WRONG_BODY for fault in state.setup_faults)
@@ -139,29 +128,6 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
         return True
     much = left and share is not None and share < 1 - rules.parts_leave
     return much and parts + off > rules.parts
-
-
-def bounded(state: Investigation) -> Noise:
-    """Noise levels for the floor: estimated ones, at most as declared or observed above the compared band."""
-    prepared = state.prepared.signals
-    declared = declared_noise(state.system, prepared, state.options.rules)
-    present = np.isin(prepared.sensor_index, state.signals.sensor_index)
-    known = declared.sensors[present]
-    seen = upper_ratio(state, known) * known
-    noise, slack = state.problem.noise, state.options.rules.verdict.slack
-    sensors = bounded_noise(noise.sensors, known, np.where(np.isfinite(seen), seen, 0.0), slack)
-    force = bounded_noise(noise.force, declared.force, np.zeros(len(noise.force)), slack)
-    return replace(noise, sensors=sensors, force=force)
-
-
-def realised_floor(expected: FloatArray, after: FreeRun, rules: VerdictRules = RULES.verdict) -> FloatArray:
-    """Noise floor of each sensor on the held-out samples themselves.
-
-    `expected` is the mean for the estimated noise.  If the error of the free run agrees with it within sampling error,
-    it is noise, and the floor of these samples; if it is smaller, so is the noise, which is part of it.
-    """
-    spread = rules.spread * np.sqrt(1 / (2 * len(after.measured)))
-    return np.where(after.per_sensor / expected - 1 < spread, after.per_sensor, expected)
 
 
 def _compared(state: Investigation, noise: Noise) -> tuple[tuple[Fit, Noise], ...]:

@@ -17,7 +17,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import settled
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.calibration import calibration_indices, is_gain, shared_gain, within_tolerance
-from sprung.model.diagnosis.investigation.judgement import leaves_more_than_noise
+from sprung.model.diagnosis.investigation.floor import leaves_more_than_noise
 from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covariance
 from sprung.model.diagnosis.investigation.redundant import without
 from sprung.model.diagnosis.investigation.state import Investigation

@@ -6,7 +6,7 @@ import pytest
 from sprung.benchmarks.shaken import building
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.excess_noise import is_what_is_left, outliers, upper_ratio
-from sprung.model.diagnosis.investigation.judgement import realised_floor
+from sprung.model.diagnosis.investigation.floor import realised_floor
 from sprung.model.diagnosis.investigation.state import Options
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.rules import RULES
