@@ -10,7 +10,9 @@ import pytest
 
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.investigation import calibration
 from sprung.model.diagnosis.investigation.calibration import within_tolerance
+from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import find_law
@@ -81,3 +83,21 @@ def test_one_gain_that_stands_alone_is_a_fault_within_what_its_data_sheet_leaves
     report = diagnose(quarter_car(), record)
     assert report.verdict == "sensor_fault"
     assert [(f.location, f.effect) for f in report.findings] == [("car_a", "sensor_gain")]
+
+
+@pytest.mark.parametrize("more", [False, True])
+def test_while_more_than_noise_is_left_no_gain_is_told_for_standing_alone(
+    more: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = simulate(seconds=10.0, seed=44)
+    record.values[:, 2] *= 1.02
+    state = begun(quarter_car(), record, Options(), lambda share, text: None)
+    gain = next(one.term for one in state.first.candidates if one.term.key[:2] == ("car_a", "sensor_gain"))
+    monkeypatch.setattr(calibration, "leaves_more_than_noise", lambda state: more)
+    after = calibration.calibrated(state, gain)
+    assert bool(after.calibrations) == more
+    if more:  # told when nothing else is left, and not before
+        monkeypatch.setattr(calibration, "is_outlier", lambda fit, terms, key, rules: key == gain.key)
+        assert calibration.faulty(after) == []
+        monkeypatch.setattr(calibration, "leaves_more_than_noise", lambda state: False)
+        assert [after.fit.point.terms[index].key for index in calibration.faulty(after)] == [gain.key]
