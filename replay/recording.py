@@ -117,7 +117,7 @@ class Recording:
         if self._start is None or not self.account.relative:
             return 0
         began = datetime.fromtimestamp(self._start / SECOND, UTC).strftime("%Y-%m-%d %H:%M:%S")
-        self.account.note(f"its times count from an unknown start: {began} UTC is assumed")
+        self.account.note(f"its times count from 0, which is taken to be {began} UTC")
         return self._start - first
 
     def _nothing(self) -> str:

@@ -280,7 +280,7 @@ def test_a_ride_whose_times_begin_at_0_gets_a_start(tmp_path: Path) -> None:
     times, _, account = read(tmp_path / "a.csv", start=START)
     assert times[0] == START
     assert account.relative
-    assert account.problems == ["its times count from an unknown start: 2026-09-21 14:13:20 UTC is assumed"]
+    assert account.problems == ["its times count from 0, which is taken to be 2026-09-21 14:13:20 UTC"]
     (tmp_path / "b.csv").write_text(table(times=SECONDS + START / 1e9))
     times, _, account = read(tmp_path / "b.csv", start=5)
     assert abs(times[0] - START) < 300

@@ -95,7 +95,7 @@ def test_a_ride_in_other_units_at_another_rate_gives_the_true_values(
         assert abs(parameter["value"] - truth) < 4 * parameter["std"]
     for said in (
         "the decimal sign is a comma",
-        "2026-09-21 14:00:00 UTC is assumed",
+        "taken to be 2026-09-21 14:00:00 UTC",
         "6 channels: 1000 Hz reduced to 200 Hz",
     ):
         assert said in err
