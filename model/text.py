@@ -44,6 +44,18 @@ def one_line(text: str, longest: int | None = None) -> str:
     return line if longest is None or len(line) <= longest else f"{line[:longest]} ..."
 
 
+def first_line(error: Exception) -> str:
+    """What an error says, without what follows in further lines; its kind where it says nothing.
+
+    Of one that wraps a database's (its `orig`), what that says.
+
+    >>> first_line(ValueError("no such topic\\nat line 7")), first_line(KeyError())
+    ('no such topic', 'KeyError')
+    """
+    said = str(getattr(error, "orig", None) or error)
+    return said.splitlines()[0] if said else type(error).__name__
+
+
 def counted(number: int, one: str, several: str = "") -> str:
     """A number of things; several: their plural, where it is not `one` with an s.
 

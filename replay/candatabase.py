@@ -11,6 +11,7 @@ from pathlib import Path
 import cantools
 from cantools.database import Database, Message
 
+from sprung.model.text import first_line
 from sprung.replay.account import UnreadableRecording
 
 MOST_MESSAGE_BYTES = 4095  # in several frames (ISO 15765-2; 1785 of SAE J1939-21), which a database may describe, too
@@ -32,8 +33,7 @@ def load_database(path: Path, strict: bool = False) -> Database:
     except UnreadableRecording:
         raise
     except Exception as error:
-        line = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UnreadableRecording(f"{path}: not a CAN database that can be read: {line}") from error
+        raise UnreadableRecording(f"{path}: not a CAN database that can be read: {first_line(error)}") from error
     if not isinstance(database, Database):
         raise UnreadableRecording(f"{path}: a diagnostics database, not one of CAN messages")
     return database

@@ -259,11 +259,6 @@ def _count_missing(
             account.values[reason] += int((mask if chosen is None else mask & chosen).sum())
 
 
-def _unheld(name: str, start: int, length: int) -> UnreadableRecording:
-    what = f"{length} bits from bit {start} on"
-    return UnreadableRecording(f"signal {name} of the CAN database: {what}, which no frame holds so")
-
-
 def _plan(channels: Sequence[Channel], database: Database) -> list[MessagePlan]:
     plans: dict[str, MessagePlan] = {}
     messages = {message.name: message for message in database.messages}
@@ -346,7 +341,8 @@ def _bits(signal: Signal) -> Bits:
     bits = Bits(signal.start, signal.length, signal.byte_order == "big_endian")
     lengths = FLOAT_BITS if signal.conversion.is_float else range(1, 65)
     if signal.length not in lengths or signal.start < 0 or bits.end > MOST_BYTES:
-        raise _unheld(signal.name, signal.start, signal.length)
+        what = f"{signal.length} bits from bit {signal.start} on"
+        raise UnreadableRecording(f"signal {signal.name} of the CAN database: {what}, which no frame holds so")
     return bits
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from cantools.database import Database
 
 from sprung.model.signals import Channel, SampleBlock, Tally
+from sprung.model.text import first_line
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.bus import BusAddress, lost_by_kernel, not_only_listened_to, opening_options, widen
 from sprung.replay.candecode import CanDecoder
@@ -218,8 +219,7 @@ class LiveBus:
 
     def _note_loss(self, error: Exception, retry: float) -> None:
         self.reconnects += 1
-        trouble = str(error).splitlines()[0] if str(error) else type(error).__name__
-        self._note_trouble(trouble, f"; trying again in {retry:.1f} s")
+        self._note_trouble(first_line(error), f"; trying again in {retry:.1f} s")
 
     def _note_trouble(self, trouble: str, next_step: str = "") -> None:
         """`connected` last, here and below: whoever reads it in another thread finds the reason already there."""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from sprung.model.text import first_line
 from sprung.service.settings import Settings
 from sprung.service.store import Store
 
@@ -44,7 +45,7 @@ class Condition:
         try:
             self._store.probe()
         except (SQLAlchemyError, OSError, TimeoutError) as error:
-            return f"the store cannot be written: {_line(error)}"
+            return f"the store cannot be written: {first_line(error)}"
         return ""
 
     def _file_troubles(self) -> list[str]:
@@ -83,7 +84,3 @@ def _open_some() -> None:
 def free_bytes(folder: Path) -> int:
     """Room on the disk of a folder."""
     return shutil.disk_usage(folder).free
-
-
-def _line(error: Exception) -> str:
-    return str(getattr(error, "orig", None) or error or type(error).__name__).splitlines()[0]

@@ -331,20 +331,19 @@ class Identifier:
             raise UnusableWindow(f"{channels[column].name}: not finite")
         return windows
 
-    def _needed(self) -> list[tuple[str, frozenset[str]]]:
-        """Sets of channels, of each of which a window must contain one at least: what they are, and their names."""
-        inputs = [("input", names) for names in self.system.needed]
-        return [*inputs, ("sensor", frozenset(self.system.sensors))]
+    def _needed(self) -> list[tuple[str, list[int]]]:
+        """Sets of columns, of each of which a window must contain one at least: what it lacks without, and which."""
+        at = {channel.name: column for column, channel in enumerate(self.system.channels)}
+        found = []
+        for what, names in (*(("input", some) for some in self.system.needed), ("sensor", set(self.system.sensors))):
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            found.append((f"missing {what} {min(names)}{more}", [at[name] for name in names]))
+        return found
 
     def _lacks(self, windows: FloatArray) -> BoolArray:
         """Of which sets of `_needed` windows (B, T, C) have no channel, (B, sets)."""
-        names = [channel.name for channel in self.system.channels]
         absent: BoolArray = np.asarray(np.isnan(windows).any(axis=1))
-        needed = self._needed()
-        found: BoolArray = np.zeros((len(windows), len(needed)), dtype=np.bool_)
-        for i, (_, some) in enumerate(needed):
-            found[:, i] = absent[:, [names.index(name) for name in some]].all(axis=1)
-        return found
+        return np.stack([absent[:, columns].all(axis=1) for _, columns in self._needed()], axis=1)
 
     def _usable(self, windows: FloatArray) -> BoolArray:
         """Which windows (B, T, C) have enough inputs and a sensor, (B,)."""
@@ -353,10 +352,9 @@ class Identifier:
     def _unusable_among(self, windows: FloatArray, found: list[Estimate]) -> list[Estimate]:
         """One estimate for each of windows (B, T, C): those `found`, and none, with the reason, for the unusable."""
         left, P, S = iter(found), len(self.system.tracked), len(self.system.sensors)
-        more = [f" and {len(names) - 1} more" if len(names) > 1 else "" for _, names in self._needed()]
-        first = [f"missing {what} {min(names)}{rest}" for (what, names), rest in zip(self._needed(), more, strict=True)]
+        needed = self._needed()
         return [
-            not_identified(P, S, first[int(np.argmax(lacks))]) if lacks.any() else next(left)
+            not_identified(P, S, needed[int(np.argmax(lacks))][0]) if lacks.any() else next(left)
             for lacks in self._lacks(windows)
         ]
 

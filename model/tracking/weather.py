@@ -32,10 +32,7 @@ ALIKE = 1.5  # ratio of nominal values within which elements of a quantity are o
 MOST_OF = 0.75  # of a kind that must move together
 FEWEST_VEHICLES = 3  # that must have learned a slope before it becomes a prior of others
 FIRST_WEEKS = 21 * 86400.0  # s in which slopes are learned
-CORRELATED = (
-    600.0,
-    0.005,
-)  # correlation time in s, and standard deviation, of errors that windows of a ride have in common
+CORRELATED = 600.0, 0.005  # correlation time in s, and standard deviation, of errors that a ride's windows share
 OF_KINDS = 3600.0, 0.01  # the same for a kind: oil and air temperature differ
 COMMON_WALK = 0.005 / math.sqrt(600.0)  # per sqrt(s), random walk of a kind's common level while the vehicle runs
 PAUSE_WALK = 0.02 / math.sqrt(3600.0)  # per sqrt(s), while it stands

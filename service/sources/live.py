@@ -19,6 +19,7 @@ from typing import Protocol
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.model.signals import SampleBlock, Tally, Window
+from sprung.model.text import first_line
 from sprung.replay.auxiliary import AuxiliaryMeans
 from sprung.service.errors import NO_THREAD, Busy
 from sprung.service.monitoring.compute import Priority
@@ -199,7 +200,7 @@ class LiveFeed:
                 return
             except Exception as error:
                 self._restarts += 1
-                self._trouble = f"{_line(error)}; trying again in {retry:.1f} s"
+                self._trouble = f"{first_line(error)}; trying again in {retry:.1f} s"
                 log.exception("the feed of %s failed; trying again in %.1f s", self.source.name, retry)
                 self._stopping.wait(retry)
                 retry = min(2.0 * retry, LAST_RETRY)
@@ -243,8 +244,8 @@ class LiveFeed:
                     self._leave_out(windows, error)
                     return
                 if not self._refused:
-                    log.error("%s: windows cannot be stored (%s); trying again", self.source.name, _line(error))
-                self._refused = _line(error)
+                    log.error("%s: windows cannot be stored (%s); trying again", self.source.name, first_line(error))
+                self._refused = first_line(error)
                 if self._stopping.wait(retry):
                     return  # said above; the service may not wait for a store that is gone
                 retry = min(2.0 * retry, LAST_RETRY)
@@ -257,7 +258,7 @@ class LiveFeed:
             return
         self._failed += 1
         self._failed_in_a_row += 1
-        self._failure = _line(error)
+        self._failure = first_line(error)
         log.error("%s: a window could not be identified and is left out", self.source.name, exc_info=error)
 
     def _watch(self) -> None:
@@ -266,7 +267,7 @@ class LiveFeed:
             try:
                 self._look()
             except Exception as error:
-                log.error("%s: what has ended could not be started anew (%s)", self.source.name, _line(error))
+                log.error("%s: what has ended could not be started anew (%s)", self.source.name, first_line(error))
 
     def _look(self) -> None:
         if not self._keeping.is_alive():
@@ -289,8 +290,3 @@ class LiveFeed:
 
 def _passes(error: Exception) -> bool:
     return isinstance(error, PASSING) or str(error) == NO_THREAD
-
-
-def _line(error: Exception) -> str:
-    text = str(getattr(error, "orig", None) or error)
-    return text.splitlines()[0] if text else type(error).__name__

@@ -20,6 +20,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import ExceptionContext, make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
 
+from sprung.model.text import first_line
 from sprung.service.errors import UserError
 
 BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
@@ -121,9 +122,9 @@ def open_store(url: str, migrated: bool = False, *, there: bool = False) -> Stor
     except ModuleNotFoundError as error:
         raise UserError(f"store {shown}: {error.name} is missing; pip install 'sprung[fleet]'") from error
     except (ArgumentError, NoSuchModuleError) as error:
-        raise UserError(f"store {shown}: not a usable database URL ({_first_line(error)})") from error
+        raise UserError(f"store {shown}: not a usable database URL ({first_line(error)})") from error
     except (DatabaseError, OSError) as error:
-        raise UserError(f"store {shown}: cannot be opened ({_first_line(error)})") from error
+        raise UserError(f"store {shown}: cannot be opened ({first_line(error)})") from error
     return store
 
 
@@ -215,7 +216,3 @@ def _name_store(context: ExceptionContext) -> None:
     """Let errors of the database say which one it is."""
     if context.sqlalchemy_exception is not None and context.engine is not None:
         context.sqlalchemy_exception.add_note(f"store {context.engine.url.render_as_string(hide_password=True)}")
-
-
-def _first_line(error: Exception) -> str:
-    return str(getattr(error, "orig", None) or error).splitlines()[0]

@@ -17,12 +17,16 @@ from sprung.model.signals import FloatArray
 
 def leaves_more_than_noise(state: Investigation) -> bool:
     """Whether the findings so far leave an unexplained share."""
-    run = state.held.run(state.fit.point)
-    size = np.sqrt(np.mean(run.measured**2, axis=0))
-    expected = state.held.noise_rms(state.fit, bounded(state)) / np.where(size > 0, size, 1.0)
-    rules = state.options.rules.verdict
-    errors = HeldOutErrors(run.per_sensor, run.per_sensor, realised_floor(expected, run, rules))
+    run, rules = state.held.run(state.fit.point), state.options.rules.verdict
+    errors = held_out_errors(run, run, state.held.noise_rms(state.fit, bounded(state)), rules)
     return bool(np.any(errors.unexplained(rules) > 0))
+
+
+def held_out_errors(before: FreeRun, after: FreeRun, floor: FloatArray, rules: VerdictRules) -> HeldOutErrors:
+    """Errors of free runs without and with the findings beside the noise (C,) that is expected, rms."""
+    size = np.sqrt(np.mean(before.measured**2, axis=0))
+    expected = floor / np.where(size > 0, size, 1.0)
+    return HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after, rules))
 
 
 def bounded(state: Investigation) -> Noise:

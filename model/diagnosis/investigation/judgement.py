@@ -8,7 +8,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.calibration import faulty, within_tolerance
-from sprung.model.diagnosis.investigation.floor import bounded, realised_floor
+from sprung.model.diagnosis.investigation.floor import bounded, held_out_errors
 from sprung.model.diagnosis.investigation.setup_effects import WRONG_BODY
 from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
@@ -36,9 +36,7 @@ def judged(
     rules = state.options.rules.verdict
     noise = bounded(state)
     floor = state.held.noise_rms(state.fit, noise)
-    size = np.sqrt(np.mean(before.measured**2, axis=0))
-    expected = floor / np.where(size > 0, size, 1.0)
-    errors = HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after, rules))
+    errors = held_out_errors(before, after, floor, rules)
     lost = state.problem.process_noise and after.nrmse > rules.rejected
     deciding = _deciding_errors(state, errors, noise, lost=lost)
     faults, physics = _kinds_of_faults(state, noisy), _kinds_of_physics(state)
