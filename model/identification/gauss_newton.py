@@ -47,11 +47,12 @@ class Linearisation:
     factor: Tensor  # Cholesky factor of the free responses' products, shape (B, N', N')
     across: Tensor  # free responses solved for the sensitivities, shape (B, N', P)
     covariance: Tensor  # of the log-ratios, weak prior included, shape (B, P, P)
+    holding: Tensor  # Cholesky factor of their information while they are held about nominal, shape (B, P, P)
     x: Tensor  # log-ratios of this point, shape (B, P)
     x0: Tensor  # best initial state here, shape (B, N)
     cost: Tensor  # weighted squares with that state, shape (B,)
     gradient: Tensor  # minus half the gradient of the cost, shape (B, P)
-    step: Tensor  # to the minimum of the linearised cost, shape (B, P)
+    step: Tensor  # to the minimum of the linearised cost, held about nominal, shape (B, P)
 
     def take(self, at: Tensor) -> Linearisation:
         """The windows `at` of the batch."""
@@ -68,7 +69,8 @@ class Chord:
     """A second step of Gauss-Newton with the products of the first."""
 
     cost: Tensor  # weighted squares before the step, shape (B,)
-    step: Tensor  # shape (B, P)
+    step: Tensor  # held about nominal, shape (B, P)
+    released: Tensor  # the same under the weak prior alone: to what the window says, shape (B, P)
     x0: Tensor  # best initial state after it, shape (B, N)
     error: Tensor  # rms of measured minus simulated before it, shape (B, S')
     residual: Tensor  # whitened, before it, shape (B, K, 1)

@@ -22,6 +22,9 @@ from sprung.model.system import System
 
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any informative window
+# Of log-ratios about nominal, where a window is linearised; it counts nothing in what the window says.  A vehicle in
+# service is within it but for what is failing, while a weak window's own maximum is far off along what it hardly shows.
+HELD_STD = 0.2
 _RIDGE = 1e-11  # relative, on the normalised free responses
 _TOLD = 0.01  # of the motion that a lost input may have at most: what it is believed to move by, where it is told
 _SHOWN = 1e-6  # relative ridge on free responses that hardly show where drives are lost
@@ -72,6 +75,8 @@ class WindowModel:
         self.blind = self._blind(lost)
         self._taken: dict[bytes, int] = {}
         self.precision = torch.as_tensor(prior_std(system) ** -2)
+        self.held = self.precision.clone()  # that of where windows are linearised
+        self.held[: len(system.parameters)] = HELD_STD**-2
 
     def _blind(self, lost: BoolArray) -> Tensor:
         """Parameters (P,) of elements that stand on supports whose drives are `lost` (W/2,): they are not identifiable.
@@ -239,9 +244,10 @@ class WindowModel:
         else:
             information = J @ J.mT - across_products.mT @ across
             gradient = (J @ at.r.mT - across.mT @ at.along).squeeze(2)
-        precision = self.precision[: x.shape[1]]
+        precision, held = self.precision[: x.shape[1]], self.held[: x.shape[1]]
         covariance = torch.linalg.inv(information + torch.diag(precision))
-        step = (covariance @ (gradient - x * precision).unsqueeze(2)).squeeze(2)
+        holding = torch.linalg.cholesky(information + torch.diag(held))
+        step = torch.cholesky_solve((gradient - x * held).unsqueeze(2), holding).squeeze(2)
         return Linearisation(
             at.whiten,
             at.transfer,
@@ -251,6 +257,7 @@ class WindowModel:
             at.factor,
             across,
             covariance,
+            holding,
             x,
             at.x0,
             at.cost,
@@ -294,11 +301,17 @@ class WindowModel:
         along = at.free @ r
         free_part = torch.cholesky_solve(along, at.factor)
         gradient = at.sensitivities @ r - at.across.mT @ along
-        step = at.covariance @ (gradient - (x * self.precision[: x.shape[1]]).unsqueeze(2))
+        step = torch.cholesky_solve(gradient - (x * self.held[: x.shape[1]]).unsqueeze(2), at.holding)
+        released = at.covariance @ (gradient - (x * self.precision[: x.shape[1]]).unsqueeze(2))
         cost = r.square().sum(dim=(1, 2)) - (along * free_part).sum(dim=(1, 2))
         x0 = x0 + ((free_part - at.across @ step).squeeze(2) / at.free_scale)[:, : x0.shape[1]]
         error = self.compression.without_trends(error, data.present)
-        return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt(), r, outputs, states)
+        error = error.square().mean(dim=1).sqrt()
+        return Chord(cost, step.squeeze(2), released.squeeze(2), x0, error, r, outputs, states)
+
+    def objective(self, x: Tensor, cost: Tensor) -> Tensor:
+        """What an iteration lowers, (B,): weighted squares `cost` and those of the log-ratios x (B, P) that are held."""
+        return cost + (x.square() * self.held[: x.shape[1]]).sum(dim=1)
 
     def simulated(self, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
         """States (B, T, N) and what all sensors show of them, (B, T, S)."""

@@ -12,6 +12,10 @@ Noise of the inputs also enters the sensitivities and would pull the estimates t
 variables).  The likelihood over the true inputs as well has the same minimum as solving J(u^)^H R^-1 r = 0 with
 the sensitivities J taken along the smoothed inputs u^ = u + S_u G^H R^-1 r; this is what is iterated.
 
+A window that is weak, as those of a slow train are, has its own maximum far off along what it hardly shows, and what it
+shows would be linearised there: springs and loads of all such windows would err alike.  Log-ratios are therefore held
+about nominal (`HELD_STD`) while they are iterated; where that ends, one step without it gives what the window says.
+
 One iteration is a full linearisation followed by a chord step: the model is simulated again at the new point and
 the old products give a second correction, at a tenth of the price.
 """
@@ -48,6 +52,7 @@ _SLACK = (
 _PER_UNKNOWN = (
     1.0  # the same, of each unknown, where nothing moves any more: in weak windows noise of the inputs lies along all
 )
+_RELEASED = 0.7  # largest change of a log-ratio, once it is held no longer
 _CONVERGED = 0.3  # a chord step this small, in standard deviations, leaves an error far below it
 
 
@@ -190,16 +195,17 @@ class Refiner:
 
     def _iterate(self, data: WindowBatch, progress: _Progress, rows: Tensor, wanted: Tensor) -> None:
         """A full linearisation and a chord step for the windows `rows`, whose data are given."""
-        x, cost, best = progress.x[rows], progress.cost[rows], progress.best[rows]
+        x, least, best = progress.x[rows], progress.least[rows], progress.best[rows]
         data = self.model.with_lost(x, data)
         at = self.model.linearise(x, data)
         step = _limited(at.step)
         data = self.model.with_lost(x + step, data)
         second = self.model.chord(at, x + step, at.state_after(step), data)
-        worse = at.cost > cost * (1 + 1e-6) + _SLACK
+        here, after = self.model.objective(x, at.cost), self.model.objective(x + step, second.cost)
+        worse = here > least * (1 + 1e-6) + _SLACK
         std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
         settled = (second.step.abs() / std).amax(dim=1) < _CONVERGED
-        held = second.cost <= at.cost * (1 + 1e-6) + _SLACK + torch.where(settled, _PER_UNKNOWN * x.shape[1], 0.0)
+        held = after <= here * (1 + 1e-6) + _SLACK + torch.where(settled, _PER_UNKNOWN * x.shape[1], 0.0)
         further = _limited(second.step)
         if self.model.lost:  # the products of before leave out what lost inputs did there, not what they do here
             near = (at.step.abs() / std).amax(dim=1) < _CONVERGED
@@ -211,7 +217,9 @@ class Refiner:
         progress.x[rows] = torch.where(worse[:, None], best + (x - best) / 3, forward)
         progress.best[rows] = torch.where(worse[:, None], best, x)
         done = small & ~worse
-        progress.cost[rows] = torch.where(done, second.cost, torch.where(worse, cost, at.cost))
+        progress.least[rows] = torch.where(done, after, torch.where(worse, least, here))
+        progress.cost[rows] = torch.where(done, second.cost, torch.where(worse, progress.cost[rows], at.cost))
+        progress.released[rows] = second.released - further
         progress.converged[rows] = done
         progress.iterations[rows] += 1
         progress.x0[rows], progress.covariance[rows] = second.x0, at.covariance
@@ -227,6 +235,7 @@ class Refiner:
             at, second, data = at.take(which), second.take(which), data.take(which)
             carried = at.transfer.drive * self.model.drive_noise[:, None]
             given = carried, at.transfer.compliance, self.model.simulator.element_values(at.x)
+            second = replace(second, step=second.released)  # of what the window says
             clean, outputs = self.calibration.smoothed(at, second, data, *given)
             shown = self.model.by_drive(at, self.calibration.motions(clean), data)
             found = self.calibration.evidence(at, replace(second, outputs=outputs), data, shown)
@@ -247,11 +256,12 @@ class Refiner:
         x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
         x0, data = self.model.settled(x, x0, data)
         identifiable, noise = self._identifiable(data, x, torch.diagonal(covariance, dim1=1, dim2=2).sqrt())
+        told, stretch = self._told(x, progress.released[rows])
         signals = len(self.model.compression.matrix(data.present))
         freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
         # What the model cannot follow is treated as more noise: intervals keep their coverage.
-        covariance = covariance * chi_square.clamp_min(1)[:, None, None]
+        covariance = covariance * chi_square.clamp_min(1)[:, None, None] * stretch[:, :, None] * stretch[:, None, :]
         both = identifiable[:, :, None] & identifiable[:, None, :]
         prior = torch.diag(1 / self.model.precision[: x.shape[1]])
         rms = np.full((len(x), len(data.present)), np.nan)
@@ -267,7 +277,7 @@ class Refiner:
         if not states:
             path, shown = path[:, :0], shown[:, :0]
         return Refined(
-            log_ratio=torch.where(identifiable, x, torch.zeros_like(x)).numpy(),
+            log_ratio=torch.where(identifiable, told, torch.zeros_like(x)).numpy(),
             covariance=torch.where(both, covariance, prior).numpy(),
             identifiable=identifiable.numpy(),
             converged=progress.converged[rows].numpy(),
@@ -280,13 +290,25 @@ class Refiner:
             outputs=shown.numpy(),
             excitation=excitation,
             weighed=progress.weighed[rows].numpy(),
-            cross=torch.where(identifiable[:, :, None], progress.cross[rows], 0.0).numpy(),
+            cross=torch.where(identifiable[:, :, None], progress.cross[rows] * stretch[:, :, None], 0.0).numpy(),
             information=(progress.information[rows] / chi_square.clamp_min(1)[:, None, None]).numpy(),
             score=(progress.score[rows] / chi_square.clamp_min(1)[:, None]).numpy(),
             noise=noise,
             diverged=np.zeros(len(x), dtype=bool),
             ended=np.zeros(len(x), dtype=bool),
         )
+
+    def _told(self, x: Tensor, released: Tensor) -> tuple[Tensor, Tensor]:
+        """What windows say, (B, P), where they were held at log-ratios x, and by what its deviations grow, (B, P).
+
+        Windows are linear in stiffnesses and dampings rather than in their logarithms: those are what the step
+        `released` is taken along, as if the window had been linearised at its end.
+        """
+        along = released[:, : len(self.system.parameters)].clamp(-_RELEASED, _RELEASED)
+        told, stretch = x + released, torch.ones_like(x)
+        told[:, : along.shape[1]] = x[:, : along.shape[1]] + along.log1p()
+        stretch[:, : along.shape[1]] = 1 / (1 + along)
+        return told, stretch
 
     def _weigh_unconverged(self, data: WindowBatch, progress: _Progress, rows: Tensor, wanted: Tensor) -> None:
         """Evidence on deviations of windows that did not converge, at their last iterate."""
@@ -321,8 +343,10 @@ class _Progress:
     """Current iterates of all windows of a batch; chunks write their own rows."""
 
     x: Tensor  # log-ratios, shape (B, P)
-    best: Tensor  # those of the lowest cost so far, shape (B, P)
-    cost: Tensor  # shape (B,)
+    best: Tensor  # those of the lowest objective so far, shape (B, P)
+    least: Tensor  # the lowest objective so far, shape (B,)
+    cost: Tensor  # weighted squares, shape (B,)
+    released: Tensor  # from x to what the window says, shape (B, P)
     x0: Tensor  # initial states, shape (B, N)
     covariance: Tensor  # shape (B, P, P)
     error: Tensor  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
@@ -342,7 +366,9 @@ class _Progress:
         return cls(
             x=x,
             best=x.clone(),
+            least=torch.full((B,), torch.inf, dtype=torch.float64),
             cost=torch.full((B,), torch.inf, dtype=torch.float64),
+            released=torch.zeros(B, P, dtype=torch.float64),
             x0=torch.zeros(B, N, dtype=torch.float64),
             covariance=torch.zeros(B, P, P, dtype=torch.float64),
             error=torch.full((B, sensors), torch.nan, dtype=torch.float64),

@@ -44,6 +44,16 @@ class DeviationModel:
     def size(self) -> int:
         return len(self.kinds)
 
+    @cached_property
+    def prior_information(self) -> FloatArray:
+        """Inverse of the prior covariance, (H, H)."""
+        return np.asarray(np.linalg.inv(self.prior), dtype=np.float64).reshape(self.size, self.size)
+
+    @cached_property
+    def of_channels(self) -> IntArray:
+        """Indices of gains and delays."""
+        return np.flatnonzero(np.isfinite(self.drift_limit))
+
     def kind_along(self, direction: FloatArray) -> str:
         """Kind of the deviations that change along a direction (H,); one direction has one kind."""
         return self.kinds[int(np.argmax(direction != 0))]

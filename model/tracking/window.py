@@ -14,8 +14,8 @@ MAX_STD = 0.2  # standard deviation of a log-ratio beyond which a window is drop
 # estimator itself drops those beyond 0.3, and so more low values than high ones
 LINEAR_STD = 0.03  # standard deviation of a log-ratio below which its skewness is negligible: an error of 0.1 %
 LINEAR_RANGE = 1.0  # log-ratio from the belief up to which a window is taken as linear in the values themselves
-COMMON = 0.45  # error common to all windows, in their deviations, where the information is input noise for the most
-NOISY = 0.08  # part; simulated, 5 to 24 m/s: half of it at this share of noise, 0.07 at 0.035, none below 0.02
+COMMON = 0.35  # error common to all windows, in their deviations, where the information is input noise for the most
+NOISY = 0.08  # part; simulated, 8 to 13 m/s: 0.3 at a share of noise of 0.17, at most 0.5 at 0.3; none below 0.02
 MANY = 500.0  # such windows, of a ride of some minutes, whose mean is as uncertain as their common error
 
 

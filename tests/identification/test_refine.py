@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from sprung.model.identification import excitation
 from sprung.model.identification.excitation import Runs, draw_log_ratios, simulate_runs
 from sprung.model.identification.features import ForceBalance, magnitudes
 from sprung.model.identification.identify import Identifier, identifiability
@@ -58,6 +59,21 @@ def test_refinement_of_hardly_informative_windows_converges() -> None:
     refined = Refiner(system).refine(slow.values, loads=True, built=True)
     assert refined.converged.all()
     assert refined.iterations.mean() < 3
+
+
+def test_weak_windows_are_hardly_biased_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(excitation, "_BAND", (0.5, 5.0))  # of a track without short waves, at the pace of a tram
+    system, rng = load_system(), np.random.default_rng(1)
+    truth = draw_log_ratios(system, 96, 0.1, rng)
+    slow = simulate_runs(system, truth, system.window, rng, speed=(9.0, 10.0))
+    refined = Refiner(system).refine(slow.values, loads=True)
+    load = np.pad(truth, ((0, 0), (0, refined.log_ratio.shape[1] - 24)))
+    z = np.where(refined.identifiable, scores(refined, load), np.nan)
+    assert 0.03 < np.median(np.sqrt(refined.covariance[:, 24, 24])) < 0.1
+    assert abs(np.nanmean(z[:, 24])) < 0.35  # linearised at the windows' own maxima: 0.6
+    assert np.nanmean(z[:, 24] ** 2) < 1.1  # 1.6
+    secondary = [i for i, p in enumerate(system.parameters) if p.name.startswith("secondary") and i < 12]
+    assert abs(np.nanmean(z[:, secondary])) < 0.25  # 0.4
 
 
 def test_windows_state_the_share_of_input_noise_in_their_information() -> None:
