@@ -65,8 +65,8 @@ def test_the_example_of_a_public_name_runs(name: str, documented: Path) -> None:
     assert examples(getattr(sprung, name), {}) > 0
 
 
-def test_the_example_of_the_client_runs(engine: Engine, system: System, tmp_path: Path) -> None:
-    core = build_core(Settings(data_dir=tmp_path, min_free_bytes=0), engine)
+def test_the_example_of_the_client_runs(engine: Engine, system: System, data_dir: Path) -> None:
+    core = build_core(Settings(data_dir=data_dir, min_free_bytes=0), engine)
     core.pipeline.process("m1", [make_window(system, i) for i in range(3)])
     with served(core) as port:
         assert examples(sprung.Client, {"url": f"http://127.0.0.1:{port}"}) > 0

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import typer
 from typer.core import TyperCommand
+from typer.main import get_command
 
 TYPE = re.compile(r" <(?:list\[)?[\w ]+\]?>")  # <list[Path]> behind a name that says it already
 WORDS = {"int": "N", "float": "N", "path": "PATH"}  # for values of such types; TEXT for others
@@ -42,6 +44,15 @@ def _plain(text: str) -> str:
 
 class PlainTyper(typer.Typer):
     """An application of such commands."""
+
+    @cached_property
+    def _built(self) -> Callable[..., Any]:
+        return get_command(self)
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        """As the library's, but commands are built once in a process, and its hook for tracebacks is not set: there
+        are none."""
+        return self._built(*args, **options)
 
     def command(self, *args: Any, **options: Any) -> Callable[[Any], Any]:
         """As the library's."""

@@ -17,7 +17,7 @@ def tried(name: str, motion: str) -> dict[str, object]:
 
 @pytest.mark.parametrize(
     ("name", "motion"),
-    [("nothing", "sine"), ("stribeck", "quake"), ("lugre", "sine"), ("friction_backlash", "sweep")],
+    [("nothing", "sine"), ("stribeck", "quake")],
 )
 def test_what_is_there_is_named(name: str, motion: str) -> None:
     line = tried(name, motion)

@@ -234,6 +234,7 @@ def test_rows_that_are_kept_are_compared_as_those_that_were_made(tmp_path: Path)
         next(kept.run("core", tmp_path, methods="zero", archive=archive))
 
 
+@pytest.mark.slow
 def test_tables_of_the_page_are_those_of_the_kept_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(document, "is_current", lambda row: True)  # the page says what made its rows
     page = kept.ARCHIVE.parent / "paper.md"

@@ -496,9 +496,9 @@ def test_an_upload_is_followed_to_its_report_and_what_was_found_is_put_to_use(
     page.close()
 
 
-def test_people_sign_in_with_their_organisation(engine: Engine, browser: Any, tmp_path: Path) -> None:
+def test_people_sign_in_with_their_organisation(engine: Engine, browser: Any, data_dir: Path) -> None:
     with running_provider() as provider:
-        core = build_core(provider_settings(provider, tmp_path), engine)
+        core = build_core(provider_settings(provider, data_dir), engine)
         with serving(core) as address:
             page = browser.new_page(viewport={"width": 1400, "height": 900})
             page.goto(f"{address}/pages/work")

@@ -27,9 +27,9 @@ pytestmark = pytest.mark.skipif(TOOL is None, reason="schemathesis is not instal
 
 
 @pytest.fixture
-def address(engine: Engine, system: System, tmp_path: Path) -> Iterator[str]:
+def address(engine: Engine, system: System, data_dir: Path) -> Iterator[str]:
     """A service with a vehicle that is good and one that is alarmed; without a token nobody gets far."""
-    core = build_core(Settings(data_dir=tmp_path, admin_token=TOKEN), engine)  # type: ignore[arg-type]
+    core = build_core(Settings(data_dir=data_dir, admin_token=TOKEN), engine)  # type: ignore[arg-type]
     server = uvicorn.Server(uvicorn.Config(create_app(core), port=0, log_level="error", lifespan="on"))
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -147,6 +147,7 @@ def test_gradients_by_gains_and_masses_beside_an_unmeasured_force_agree_with_fin
     assert slope == pytest.approx(difference, rel=within)
 
 
+@pytest.mark.slow
 def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values() -> None:
     gap, stop = 1.2e-3, 2e5
     report = diagnose(

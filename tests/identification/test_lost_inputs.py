@@ -117,7 +117,12 @@ def followed(
 
 
 @pytest.mark.parametrize(
-    ("at", "kind"), [(None, "frozen"), (np.nan, "silent"), pytest.param(4.0, "frozen", marks=pytest.mark.slow)]
+    ("at", "kind"),
+    [
+        (None, "frozen"),
+        pytest.param(np.nan, "silent", marks=pytest.mark.slow),
+        pytest.param(4.0, "frozen", marks=pytest.mark.slow),
+    ],
 )
 def test_a_vehicle_stays_monitored_while_a_wheel_is_lost(at: float | None, kind: str) -> None:
     """Frozen at its mean, far off, or silent: the wheel is named, a damper of the other bogie found, and nothing else

@@ -179,7 +179,7 @@ def test_a_stuck_sensor_is_named_and_the_window_used_without_it(
         assert [(f.channel, f.kind) for f in estimate.faults] == ([("bogie1_1r", kind)] if estimate.faults else [])
 
 
-@pytest.mark.parametrize("gain", [0.02, 0.05, 0.1])
+@pytest.mark.parametrize("gain", [0.02, pytest.param(0.05, marks=pytest.mark.slow), 0.1])
 def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(
     system: System, identifier: Identifier, gain: float
 ) -> None:
@@ -214,7 +214,7 @@ def test_an_instrument_that_is_late_or_off_below_is_named_with_both_its_quantiti
         assert np.abs(mean / std).max() < 3.5
 
 
-@pytest.mark.parametrize("seed", [5, 9, 11])
+@pytest.mark.parametrize("seed", [5, pytest.param(9, marks=pytest.mark.slow), pytest.param(11, marks=pytest.mark.slow)])
 def test_a_late_accelerometer_below_is_no_change_of_its_damper(seed: int) -> None:
     """Noise of accelerometers hides 0.6 ms for half a minute, in which the damper at the wheel seems to change."""
     system = load_system(BUNDLED / "axleboxes.yaml")
@@ -276,7 +276,9 @@ def test_a_large_delay_from_the_first_window_on_is_accepted_at_once(system: Syst
     assert np.abs(mean / std).max() < 4.0
 
 
-@pytest.mark.parametrize("load", [0.02, 0.1, 0.3])
+@pytest.mark.parametrize(
+    "load", [pytest.param(0.02, marks=pytest.mark.slow), 0.1, pytest.param(0.3, marks=pytest.mark.slow)]
+)
 def test_passengers_change_the_load_and_no_spring(system: System, identifier: Identifier, load: float) -> None:
     tracker, state = tracked(system, identifier, record(40, 7, load))
     assert state.alarms == ()

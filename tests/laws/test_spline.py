@@ -131,6 +131,7 @@ def test_the_force_is_the_one_that_was_put_in(name: str) -> None:
     assert latent.log_evidence > 50
 
 
+@pytest.mark.slow
 def test_the_band_holds_the_truth_as_often_as_it_says() -> None:
     run = NonlinearSimulator(MECHANICS, RATE).run(road(1), [])
     d, v = run.deflection[:, 1], run.rate[:, 1]

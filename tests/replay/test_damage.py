@@ -78,7 +78,7 @@ def test_flipped_bits_in_an_mcap_file_never_give_a_wrong_number(compression: Com
     whole = path.read_bytes()
     rng = np.random.default_rng(2)
     used, uncounted = [], 0
-    for _ in range(150):
+    for _ in range(60):
         damaged = bytearray(whole)
         damaged[rng.integers(8, len(whole))] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)
@@ -94,7 +94,7 @@ def test_flipped_bits_in_an_mcap_file_never_give_a_wrong_number(compression: Com
         if counts["used"] < ROWS:
             assert recording.incomplete or counts["dropped"] or counts["foreign"] > 30
     assert np.mean(used) > 0.85 * ROWS  # a flip costs a chunk, not the recording
-    assert uncounted <= 5  # a flip in the statistics or in an index may take the expected number with it
+    assert uncounted <= 3  # a flip in the statistics or in an index may take the expected number with it
 
 
 def test_a_damaged_chunk_costs_its_messages_only_and_they_are_counted(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_flipped_bits_in_a_blf_file_are_found_and_counted(tmp_path: Path, dbc: P
     write_can(path)
     whole = path.read_bytes()
     rng = np.random.default_rng(3)
-    for _ in range(150):
+    for _ in range(60):
         damaged = bytearray(whole)
         damaged[rng.integers(144, len(whole))] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)

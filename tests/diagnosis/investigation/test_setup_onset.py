@@ -70,7 +70,10 @@ def test_a_driving_point_has_a_motion_sensor_at_the_only_force() -> None:
 ANOTHER = TOWER.replace("s3: {upper: f3, lower: f2", "s3: {upper: f3, lower: f1")  # not as it was simulated
 
 
-@pytest.mark.parametrize(("column", "place"), [pytest.param(0, "shaker", marks=pytest.mark.slow), (3, "a3")])
+@pytest.mark.parametrize(
+    ("column", "place"),
+    [pytest.param(0, "shaker", marks=pytest.mark.slow), pytest.param(3, "a3", marks=pytest.mark.slow)],
+)
 def test_a_reversed_sign_is_named_although_the_structure_is_another(column: int, place: str) -> None:
     values = tower()
     values[:, column] *= -1

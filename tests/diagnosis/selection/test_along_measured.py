@@ -69,6 +69,7 @@ def earthquake(seconds: float = 20.0, fine: int = 40, slow: float = SLOW, *, fil
     return Earthquake(values + random.standard_normal(values.shape) * [0.003, 0.003, 2e-5])
 
 
+@pytest.mark.slow
 def test_what_is_fitted_along_the_measured_motion_begins_near_the_truth() -> None:
     system, record = parse_system(SLAB), earthquake()
     signals = prepare(system, record.values, RATE).signals

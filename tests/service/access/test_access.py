@@ -214,8 +214,8 @@ def test_the_last_token_revoked_does_not_open_the_service(client: TestClient, co
     assert client.get("/vehicles").status_code == 401
 
 
-def test_the_settings_token_allows_everything(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(Settings(data_dir=tmp_path, admin_token=SecretStr("a-very-long-secret-of-mine")), engine)
+def test_the_settings_token_allows_everything(engine: Engine, data_dir: Path) -> None:
+    core = build_core(Settings(data_dir=data_dir, admin_token=SecretStr("a-very-long-secret-of-mine")), engine)
     with TestClient(create_app(core)) as client:
         assert client.get("/tokens", headers=bearer("a-very-long-secret-of-mine")).status_code == 200
         assert client.get("/tokens", headers=bearer("a-very-long-secret-of-mine2")).status_code == 401
@@ -394,9 +394,9 @@ def test_clients_that_ask_too_often_are_told_when_to_come_back() -> None:
 
 
 @pytest.fixture
-def strict(engine: Engine, tmp_path: Path) -> Core:
+def strict(engine: Engine, data_dir: Path) -> Core:
     """Ten requests at once, then one in ten seconds (nearly none in the time of a test)."""
-    core = build_core(Settings(data_dir=tmp_path, client_requests_per_second=0.1), engine)
+    core = build_core(Settings(data_dir=data_dir, client_requests_per_second=0.1), engine)
     core.tokens.create("boss", ["admin"])
     return core
 
@@ -436,8 +436,8 @@ def test_who_tries_tokens_runs_dry_and_others_do_not(strict: Core, token: str, m
     assert len(looked) == 1 + bool(token)  # what is refused for coming too often is not looked up
 
 
-def test_a_token_that_was_good_is_taken_beside_others_that_are_not(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(Settings(data_dir=tmp_path, client_requests_per_second=2), engine)
+def test_a_token_that_was_good_is_taken_beside_others_that_are_not(engine: Engine, data_dir: Path) -> None:
+    core = build_core(Settings(data_dir=data_dir, client_requests_per_second=2), engine)
     good, _ = core.tokens.create("feeder", ["read"])
     wrong = [("a", "/vehicles", f"rubbish{i}") for i in range(20)]
     found = statuses(core, ("a", "/vehicles", good), *wrong, ("a", "/vehicles", good))

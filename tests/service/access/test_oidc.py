@@ -38,8 +38,8 @@ def provider() -> Iterator[FakeProvider]:
 
 
 @pytest.fixture
-def client(provider: FakeProvider, engine: Engine, tmp_path: Path) -> Iterator[TestClient]:
-    core = build_core(provider_settings(provider, tmp_path), engine)
+def client(provider: FakeProvider, engine: Engine, data_dir: Path) -> Iterator[TestClient]:
+    core = build_core(provider_settings(provider, data_dir), engine)
     with TestClient(create_app(core), raise_server_exceptions=False, follow_redirects=False) as running:
         yield running
 
@@ -191,12 +191,12 @@ def test_a_provider_that_is_back_is_asked_again(
 
 
 def test_sign_ins_that_wait_for_a_provider_hold_up_nobody_else(
-    engine: Engine, tmp_path: Path, provider: FakeProvider
+    engine: Engine, data_dir: Path, provider: FakeProvider
 ) -> None:
     """It takes connections and never answers; more people sign in than the service has threads."""
     with socket.create_server(("127.0.0.1", 0), backlog=200) as silent:
         provider.issuer = f"http://127.0.0.1:{silent.getsockname()[1]}"
-        core = build_core(provider_settings(provider, tmp_path), engine)
+        core = build_core(provider_settings(provider, data_dir), engine)
         token = core.tokens.create("t", ["read"])[0]
         with served(core) as port:
 

@@ -317,8 +317,8 @@ def test_health_tells_ready_until_the_service_stops(client: TestClient, core: Co
     assert client.get("/health/live").status_code == 200
 
 
-def test_a_restarted_service_shows_what_it_knew(engine: Engine, tmp_path: Path, system: System) -> None:
-    settings = Settings(data_dir=tmp_path)
+def test_a_restarted_service_shows_what_it_knew(engine: Engine, data_dir: Path, system: System) -> None:
+    settings = Settings(data_dir=data_dir)
     with TestClient(create_app(first := build_core(settings, engine))):
         feed(first, system, 10, level=0.1)
     with TestClient(create_app(build_core(settings, engine))) as client:

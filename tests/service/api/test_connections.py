@@ -34,9 +34,9 @@ def client(stack: ExitStack, port: int, host: str, data: bytes) -> socket.socket
 
 
 @pytest.mark.parametrize("data", [HALF, LARGE])
-def test_many_addresses_together_do_not_lock_others_out(engine: Engine, tmp_path: Path, data: bytes) -> None:
+def test_many_addresses_together_do_not_lock_others_out(engine: Engine, data_dir: Path, data: bytes) -> None:
     limits = {"connections": 24, "client_connections": 10, "header_seconds": 60, "body_idle_seconds": 60}
-    core = build_core(settings(tmp_path, **limits), engine)
+    core = build_core(settings(data_dir, **limits), engine)
     with served(core) as port, ExitStack() as stack:
         for address in [f"127.0.0.{k}" for k in (2, 3, 4)] * 10:
             client(stack, port, address, data)
@@ -48,8 +48,8 @@ def test_many_addresses_together_do_not_lock_others_out(engine: Engine, tmp_path
             time.sleep(0.2)
 
 
-def test_an_answer_that_nobody_takes_is_given_up(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(settings(tmp_path, body_idle_seconds=1), engine)
+def test_an_answer_that_nobody_takes_is_given_up(engine: Engine, data_dir: Path) -> None:
+    core = build_core(settings(data_dir, body_idle_seconds=1), engine)
     with served(core) as port, ExitStack() as stack:
         for data in (LARGE, 4 * ONE + ONE.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")):
             silent, taken = client(stack, port, "127.0.0.2", data), 0
@@ -61,9 +61,9 @@ def test_an_answer_that_nobody_takes_is_given_up(engine: Engine, tmp_path: Path)
         assert len(ask(port, "/static/vendor/swagger-ui-bundle.js")) > 1_400_000
 
 
-def test_others_are_served_while_slow_clients_are_answered(engine: Engine, tmp_path: Path) -> None:
+def test_others_are_served_while_slow_clients_are_answered(engine: Engine, data_dir: Path) -> None:
     """They take a little all the time, so that none of them only waits."""
-    core = build_core(settings(tmp_path, connections=24, client_connections=12), engine)
+    core = build_core(settings(data_dir, connections=24, client_connections=12), engine)
     with served(core) as port, ExitStack() as stack:
         slow = [client(stack, port, f"127.0.0.{2 + k % 2}", LARGE) for k in range(24)]
         for _ in range(5):
@@ -74,8 +74,8 @@ def test_others_are_served_while_slow_clients_are_answered(engine: Engine, tmp_p
             time.sleep(0.1)
 
 
-def test_who_is_refused_hears_why(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(settings(tmp_path, client_connections=2), engine)
+def test_who_is_refused_hears_why(engine: Engine, data_dir: Path) -> None:
+    core = build_core(settings(data_dir, client_connections=2), engine)
     with served(core) as port, ExitStack() as stack:
         following = b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n"
         for one in [client(stack, port, "127.0.0.1", following) for _ in range(2)]:
@@ -87,9 +87,9 @@ def test_who_is_refused_hears_why(engine: Engine, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("begun", [HALF, UPLOAD])
 def test_requests_that_are_begun_and_broken_off_cost_their_client_the_next_connections(
-    engine: Engine, tmp_path: Path, begun: bytes
+    engine: Engine, data_dir: Path, begun: bytes
 ) -> None:
-    core = build_core(settings(tmp_path, client_broken_per_second=0.5), engine)
+    core = build_core(settings(data_dir, client_broken_per_second=0.5), engine)
     with served(core) as port, ExitStack() as stack:
         for _ in range(3):
             client(stack, port, "127.0.0.2", begun).close()
@@ -101,8 +101,8 @@ def test_requests_that_are_begun_and_broken_off_cost_their_client_the_next_conne
         assert b"200 OK" in ask(port)
 
 
-def test_what_is_given_up_does_not_stay_in_the_kernel(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(settings(tmp_path, body_idle_seconds=1), engine)
+def test_what_is_given_up_does_not_stay_in_the_kernel(engine: Engine, data_dir: Path) -> None:
+    core = build_core(settings(data_dir, body_idle_seconds=1), engine)
     with served(core) as port, ExitStack() as stack:
         silent, taken = client(stack, port, "127.0.0.2", ONE), 0
         time.sleep(3.0)

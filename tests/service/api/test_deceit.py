@@ -52,9 +52,9 @@ def test_a_terminal_is_told_nothing_by_a_log() -> None:
     assert PlainLines().format(logging.makeLogRecord(told)) == r"sprung: ERROR: \x1b[2Jof\x07 x.csv"
 
 
-def test_a_body_of_two_lengths_is_refused_and_the_connection_closed(engine: Engine, tmp_path: Path) -> None:
+def test_a_body_of_two_lengths_is_refused_and_the_connection_closed(engine: Engine, data_dir: Path) -> None:
     with (
-        served(build_core(settings(tmp_path), engine)) as port,
+        served(build_core(settings(data_dir), engine)) as port,
         socket.create_connection(("127.0.0.1", port), timeout=10) as line,
     ):
         two = b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 5\r\n"
@@ -70,9 +70,9 @@ def test_a_body_of_two_lengths_is_refused_and_the_connection_closed(engine: Engi
     "request_",
     [b"\x16\x03\x01\x02\x00", b"GET /\r\n\r\n", b"POST /identify HTTP/1.1\r\nHost: x\r\nContent-Length: +2\r\n\r\n{}"],
 )
-def test_what_is_no_http_is_answered_as_every_error(engine: Engine, tmp_path: Path, request_: bytes) -> None:
+def test_what_is_no_http_is_answered_as_every_error(engine: Engine, data_dir: Path, request_: bytes) -> None:
     with (
-        served(build_core(settings(tmp_path), engine)) as port,
+        served(build_core(settings(data_dir), engine)) as port,
         socket.create_connection(("127.0.0.1", port), timeout=10) as line,
     ):
         line.sendall(request_ + b"\r\n\r\n")
@@ -86,10 +86,10 @@ def test_what_is_no_http_is_answered_as_every_error(engine: Engine, tmp_path: Pa
 
 @pytest.mark.parametrize("version", ["0.9", "2.0", "3.0", "9.9", "1.0", "1.1", "1.9"])
 def test_only_requests_in_a_version_that_is_spoken_here_are_answered(
-    engine: Engine, tmp_path: Path, version: str
+    engine: Engine, data_dir: Path, version: str
 ) -> None:
     with (
-        served(build_core(settings(tmp_path), engine)) as port,
+        served(build_core(settings(data_dir), engine)) as port,
         socket.create_connection(("127.0.0.1", port), timeout=10) as line,
     ):
         line.sendall(f"GET /health/live HTTP/{version}\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
@@ -108,12 +108,12 @@ def test_nobody_is_sent_to_the_host_that_he_names(client: TestClient, path: str)
 
 @pytest.mark.parametrize("more", [b"Content-Length: 5\r\n", b""], ids=["refused at once", "read to its end"])
 def test_a_body_that_goes_wrong_on_its_way_is_answered_once_and_logged_as_no_mistake_of_the_service(
-    engine: Engine, tmp_path: Path, caplog: pytest.LogCaptureFixture, more: bytes
+    engine: Engine, data_dir: Path, caplog: pytest.LogCaptureFixture, more: bytes
 ) -> None:
     """Also when it comes in one piece with its head, before the application has begun to answer."""
     head = b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     with (
-        served(build_core(settings(tmp_path), engine)) as port,
+        served(build_core(settings(data_dir), engine)) as port,
         socket.create_connection(("127.0.0.1", port), timeout=10) as line,
     ):
         line.sendall(head + more + b"Transfer-Encoding: chunked\r\n\r\n5\r\n{}   \r\n-1\r\n")

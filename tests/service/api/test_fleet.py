@@ -169,14 +169,14 @@ def test_what_does_not_fit_is_reported_and_its_prior_is_no_history(
     assert client.get("/vehicles/a/history?parameter=primary_11l.stiffness").json()["points"] == []
 
 
-def test_alarms_of_an_earlier_model_stay_in_sight(engine: Engine, tmp_path: Path, system: System) -> None:
-    first = build_core(Settings(data_dir=tmp_path), engine)
+def test_alarms_of_an_earlier_model_stay_in_sight(engine: Engine, data_dir: Path, system: System) -> None:
+    first = build_core(Settings(data_dir=data_dir), engine)
     with TestClient(create_app(first)):
         alarmed(first, system, "a")
     bodies = {**system.file.bodies, "car": system.file.bodies["car"].model_copy(update={"roll_inertia": 6e4})}
     heavier = System(system.file.model_copy(update={"bodies": bodies}))
     other = Engine(heavier, FakeIdentifier(heavier, digest="fake-2"), engine.tracker, None)
-    second = build_core(Settings(data_dir=tmp_path), other)
+    second = build_core(Settings(data_dir=data_dir), other)
     with TestClient(create_app(second)) as client:
         assert client.get("/vehicles").json()["vehicles"][0]["health"] == "out_of_specification"
         feed(second, system, "a", 5, first=500)
@@ -185,15 +185,15 @@ def test_alarms_of_an_earlier_model_stay_in_sight(engine: Engine, tmp_path: Path
         assert client.get("/vehicles/a/alarms?active=true").json()["alarms"]
 
 
-def test_other_weights_and_other_noises_go_on_with_the_history(engine: Engine, tmp_path: Path, system: System) -> None:
-    first = build_core(Settings(data_dir=tmp_path), engine)
+def test_other_weights_and_other_noises_go_on_with_the_history(engine: Engine, data_dir: Path, system: System) -> None:
+    first = build_core(Settings(data_dir=data_dir), engine)
     with TestClient(create_app(first)):
         alarmed(first, system, "a")
     sensors = {name: s.model_copy(update={"noise": 2 * s.noise}) for name, s in system.file.sensors.items()}
     noisier = System(system.file.model_copy(update={"name": "renamed", "sensors": sensors}))
     assert noisier.digest != system.digest and noisier.structure == system.structure
     other = Engine(noisier, FakeIdentifier(noisier, digest="fake-2"), engine.tracker, None)
-    second = build_core(Settings(data_dir=tmp_path), other)
+    second = build_core(Settings(data_dir=data_dir), other)
     assert second.pipeline.model_id == first.pipeline.model_id
     with TestClient(create_app(second)) as client:
         before = client.get("/vehicles/a").json()
@@ -205,14 +205,14 @@ def test_other_weights_and_other_noises_go_on_with_the_history(engine: Engine, t
 
 
 def test_a_store_of_an_earlier_version_is_listed_after_the_start(
-    engine: Engine, tmp_path: Path, system: System
+    engine: Engine, data_dir: Path, system: System
 ) -> None:
-    first = build_core(Settings(data_dir=tmp_path), engine)
+    first = build_core(Settings(data_dir=data_dir), engine)
     with TestClient(create_app(first)):
         alarmed(first, system, "a")
     with first.store.write() as connection:
         connection.execute(fleet_status.delete())
-    with TestClient(create_app(build_core(Settings(data_dir=tmp_path), engine))) as client:
+    with TestClient(create_app(build_core(Settings(data_dir=data_dir), engine))) as client:
         assert client.get("/vehicles").json()["vehicles"][0]["health"] == "out_of_specification"
         assert 'sprung_alarms_active{severity="alarm",vehicle="a"} 0.0' not in client.get("/metrics").text
 

@@ -56,8 +56,8 @@ def settings(tmp_path: Path, **changes: Any) -> Settings:
     return Settings(data_dir=tmp_path, min_free_bytes=0, **changes)
 
 
-def test_half_sent_requests_do_not_make_the_service_unreachable(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(settings(tmp_path, client_connections=40, header_seconds=60), engine)
+def test_half_sent_requests_do_not_make_the_service_unreachable(engine: Engine, data_dir: Path) -> None:
+    core = build_core(settings(data_dir, client_connections=40, header_seconds=60), engine)
     with served(core) as port, ExitStack() as stack:
         for _ in range(120):
             held = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10))
@@ -67,21 +67,21 @@ def test_half_sent_requests_do_not_make_the_service_unreachable(engine: Engine, 
         assert time.monotonic() - begun < 10.0
 
 
-def test_a_header_that_does_not_come_is_not_waited_for(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(settings(tmp_path, header_seconds=0.5), engine)
+def test_a_header_that_does_not_come_is_not_waited_for(engine: Engine, data_dir: Path) -> None:
+    core = build_core(settings(data_dir, header_seconds=0.5), engine)
     with served(core) as port, socket.create_connection(("127.0.0.1", port)) as slow:
         slow.sendall(b"GET / HTTP/1.1\r\nHost:")
         assert closed_within(slow, 10)
 
 
-def test_nothing_at_all_is_not_waited_for_either(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(settings(tmp_path, header_seconds=0.5), engine)
+def test_nothing_at_all_is_not_waited_for_either(engine: Engine, data_dir: Path) -> None:
+    core = build_core(settings(data_dir, header_seconds=0.5), engine)
     with served(core) as port, socket.create_connection(("127.0.0.1", port)) as silent:
         assert closed_within(silent, 10)
 
 
-def test_a_body_that_stops_coming_is_given_up(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(settings(tmp_path, body_idle_seconds=0.5), engine)
+def test_a_body_that_stops_coming_is_given_up(engine: Engine, data_dir: Path) -> None:
+    core = build_core(settings(data_dir, body_idle_seconds=0.5), engine)
     with served(core) as port, socket.create_connection(("127.0.0.1", port)) as slow:
         kind = b"Content-Type: application/json\r\n"
         slow.sendall(b"POST /identify HTTP/1.1\r\nHost: localhost\r\n" + kind + b"Content-Length: 5000\r\n\r\n{")
@@ -90,9 +90,9 @@ def test_a_body_that_stops_coming_is_given_up(engine: Engine, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("trusted", [False, True])
-def test_what_a_proxy_says_is_accepted_of_trusted_ones_only(engine: Engine, tmp_path: Path, trusted: bool) -> None:
+def test_what_a_proxy_says_is_accepted_of_trusted_ones_only(engine: Engine, data_dir: Path, trusted: bool) -> None:
     proxies = ("127.0.0.0/8",) if trusted else ()
-    core = build_core(settings(tmp_path, client_requests_per_second=0.1, trusted_proxies=proxies), engine)
+    core = build_core(settings(data_dir, client_requests_per_second=0.1, trusted_proxies=proxies), engine)
     with served(core) as port:
         said = [f"X-Forwarded-For: 192.0.2.{i}\r\nX-Forwarded-Proto: https\r\n" for i in range(3)]
         found = [ask(port, "/signin", headers=text) for text in said]
@@ -106,8 +106,8 @@ def test_proxies_are_named_by_address(tmp_path: Path, wrong: str) -> None:
         settings(tmp_path, trusted_proxies=(wrong,))
 
 
-def test_a_connection_that_is_kept_alive_stays_between_requests(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(settings(tmp_path, header_seconds=0.5, body_idle_seconds=0.5), engine)
+def test_a_connection_that_is_kept_alive_stays_between_requests(engine: Engine, data_dir: Path) -> None:
+    core = build_core(settings(data_dir, header_seconds=0.5, body_idle_seconds=0.5), engine)
     with served(core) as port, socket.create_connection(("127.0.0.1", port), timeout=10) as kept:
         for _ in range(3):
             kept.sendall(b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -135,10 +135,10 @@ def certificate(folder: Path, name: str, by: Path | None = None) -> Path:
     return path
 
 
-def test_mutual_tls_lets_in_who_shows_a_certificate_and_nobody_else(engine: Engine, tmp_path: Path) -> None:
-    authority = certificate(tmp_path, "authority")
-    server, client = certificate(tmp_path, "server", authority), certificate(tmp_path, "client", authority)
-    core = build_core(settings(tmp_path, tls_certificate=server, tls_client_ca=authority, header_seconds=3), engine)
+def test_mutual_tls_lets_in_who_shows_a_certificate_and_nobody_else(engine: Engine, data_dir: Path) -> None:
+    authority = certificate(data_dir, "authority")
+    server, client = certificate(data_dir, "server", authority), certificate(data_dir, "client", authority)
+    core = build_core(settings(data_dir, tls_certificate=server, tls_client_ca=authority, header_seconds=3), engine)
     with served(core) as port, socket.create_connection(("127.0.0.1", port)) as silent:
         context = ssl.create_default_context(cafile=str(authority))
 
@@ -213,8 +213,8 @@ def test_numbers_beyond_those_of_the_store_are_wrong_and_no_fault_of_ours(client
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Core:
-    return build_core(settings(tmp_path, max_uploads_bytes=50_000), engine)
+def core(engine: Engine, data_dir: Path) -> Core:
+    return build_core(settings(data_dir, max_uploads_bytes=50_000), engine)
 
 
 @pytest.fixture

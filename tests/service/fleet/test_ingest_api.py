@@ -21,8 +21,8 @@ HEADERS = {"content-type": MEDIA_TYPE}
 
 
 @pytest.fixture
-def client(engine: Engine, tmp_path: Path) -> Iterator[TestClient]:
-    with TestClient(create_app(build_core(Settings(data_dir=tmp_path, late_seconds=0), engine))) as running:
+def client(engine: Engine, data_dir: Path) -> Iterator[TestClient]:
+    with TestClient(create_app(build_core(Settings(data_dir=data_dir, late_seconds=0), engine))) as running:
         yield running
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -16,7 +17,8 @@ import pytest
 from cantools.database.can import Database
 from fastapi.testclient import TestClient
 
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, parse_system
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, parse_system
+from sprung.model.tracking.tracker import Tracker
 from sprung.replay.live import LiveBus
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
@@ -36,12 +38,17 @@ from tests.service_fakes import START, FakeIdentifier, diagnose, eventually, hol
 SECONDS = 5
 
 
+@pytest.fixture(scope="module")
+def tracked_columns() -> tuple[System, Tracker]:
+    """The Manchester system, its signals found in the columns of a CSV file, and its tracker."""
+    found = parse_system(MANCHESTER.read_text().replace("can: ", "csv: "))
+    return found, make_tracker(found)
+
+
 @pytest.fixture
-def csv_engine() -> Engine:
-    """The Manchester system, its signals found in the columns of a CSV file."""
-    text = MANCHESTER.read_text().replace("can: ", "csv: ")
-    found = parse_system(text)
-    return Engine(found, FakeIdentifier(found), make_tracker(found))
+def csv_engine(tracked_columns: tuple[System, Tracker]) -> Engine:
+    system, tracker = tracked_columns
+    return Engine(system, FakeIdentifier(system), tracker)
 
 
 @pytest.fixture
@@ -57,8 +64,11 @@ def recording(tmp_path: Path, csv_engine: Engine) -> Path:
 
 
 @pytest.fixture
-def core(csv_engine: Engine, tmp_path: Path, reading_here: None) -> Core:
-    core = build_core(Settings(data_dir=tmp_path / "data", misfit_seconds=5, job_queue=2), csv_engine)
+def core(csv_engine: Engine, tmp_path: Path, empty_store: Path, reading_here: None) -> Core:
+    data = tmp_path / "data"
+    data.mkdir()
+    shutil.copy(empty_store, data / "sprung.db")
+    core = build_core(Settings(data_dir=data, misfit_seconds=5, job_queue=2), csv_engine)
     core.diagnosis_jobs.task = diagnose
     return core
 
@@ -227,8 +237,8 @@ def test_more_jobs_than_the_queue_holds_are_refused(client: TestClient, core: Co
     assert answers == [202, 202, 503]
 
 
-def test_a_virtual_bus_is_followed_within_two_seconds(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(Settings(data_dir=tmp_path), engine)
+def test_a_virtual_bus_is_followed_within_two_seconds(engine: Engine, data_dir: Path) -> None:
+    core = build_core(Settings(data_dir=data_dir), engine)
     database = cantools.database.load_file(MANCHESTER_DBC)
     assert isinstance(database, Database)
     bus = LiveBus("virtual", "sprung-test", engine.system.channels, MANCHESTER_DBC, stop=core.stopping)
@@ -259,8 +269,8 @@ def test_a_virtual_bus_is_followed_within_two_seconds(engine: Engine, tmp_path: 
 
 
 @pytest.mark.parametrize("name", ["can0", "virtual:", ":0", "carrier-pigeon:0", "virtual:x,fd"])
-def test_a_bus_that_cannot_be_is_one_clear_line(engine: Engine, tmp_path: Path, name: str) -> None:
-    core = build_core(Settings(data_dir=tmp_path), engine)
+def test_a_bus_that_cannot_be_is_one_clear_line(engine: Engine, data_dir: Path, name: str) -> None:
+    core = build_core(Settings(data_dir=data_dir), engine)
     try:
         with pytest.raises(ValueError, match="can"):
             live_feed(core, name, None)

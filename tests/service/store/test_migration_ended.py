@@ -15,7 +15,7 @@ from sprung.benchmarks.trust_steps import STEPS
 from sprung.benchmarks.trust_zygote import DONE, Zygote
 from sprung.service.store import open_store
 
-ENDED = 8  # moments
+ENDED = 4  # moments
 SERVE = """
 import os, signal, time
 from sqlalchemy import Engine, event
