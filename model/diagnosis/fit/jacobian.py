@@ -242,7 +242,8 @@ def _add_laws_answers(
     correction = SmootherCorrection(whitener, forward, forces) if problem.process_noise else None
     if correction is not None:
         along = along - correction.motion(known.packed.whitened)
-    extra = tangent(forward, forces, along, correction, fine=fine)
+    extra, evaluations = tangent(forward, forces, along, correction, fine=fine)
+    problem.count(evaluations)
     for k, port in enumerate(forces.ports):
         for column in range(extra.shape[2]):
             known.packed.add_port(column, port, extra[:, k, column])

@@ -57,6 +57,11 @@ class Problem:
         """Whether the budget of work is exhausted."""
         return self.work is not None and self.work.ended
 
+    def count(self, evaluations: float) -> None:
+        """Count evaluations of a law along the oversampled record as work."""
+        if self.work is not None:
+            self.work.add(_ROUND * evaluations * self.part.grid.samples)
+
     def forward(self, point: Point, inputs: SmoothedInputs | None = None, known: Plant | None = None) -> Forward:
         """The model at a point under the measured inputs, or under smoothed ones.
 
@@ -73,8 +78,7 @@ class Problem:
         """Shown sensor signals, (F, S), the model, and the forces of its laws."""
         forward = self.forward(point, inputs, known)
         forces = law_forces(forward, point, inputs)
-        if self.work is not None and forces is not None:
-            self.work.add(_ROUND * forces.evaluations * self.part.grid.samples)
+        self.count(0 if forces is None else forces.evaluations)
         return self.shown(forward, forces), forward, forces
 
     def shown(self, forward: Forward, forces: LawForces | None) -> ComplexArray:

@@ -8,18 +8,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.fft import irfft
 
 from sprung.model.diagnosis.fit.problem import Problem, SmoothedInputs
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Part
-from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
+from sprung.model.diagnosis.response.forward import Forward, propagate
 from sprung.model.diagnosis.response.frf import Plant
-from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, LawForces, fixed_point
+from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, fixed_point
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.signals import FloatArray
 
 _FOLLOWED = 1e-4  # relative tolerance of the laws' forces along a smoothed motion
 _UNSEEN = 1e-26  # of the largest squared sensitivity to a state: rounding
+_COSTLY = 2.0  # times a free run's, the cost of an evaluation that smooths the inputs as well
 _WIDTH = 21  # bins over which the residual's level is averaged
 
 
@@ -57,50 +60,161 @@ def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Workin
     to the measured one rather than a free run.  Laws' forces, state and smoothed inputs depend on each other and are
     found by fixed-point iteration.
     """
-    part = problem.part
     forward = problem.forward(replace(point, warm_start=()))
-    whitener = Whitener.of(forward, problem.noise)  # of the present plant
-    free = problem.free_columns(forward)
-    columns = whitener(free, part)
-    scale = scale_of(columns.T @ columns, columns.shape[1])
-    of_residual = scale[:, None] * np.linalg.pinv(columns * scale, rcond=1e-9)
-
-    def explained(forces: LawForces | None) -> tuple[FloatArray, Part]:
-        spectrum = part.sensors - problem.shown(forward, forces)
-        state = of_residual @ whitener(spectrum, part)
-        return state, _smoothed(part, whitener, spectrum - free @ state)
-
+    smoother = _Smoother.of(problem, forward)
     balance = forward.harmonic_balance(point.state)
     if balance is None:
-        state, inputs = explained(None)
-        return replace(point, state=state), Working(whitener, SmoothedInputs(inputs), forward.plant)
-
-    def along(force: FloatArray, balance: HarmonicBalance = balance) -> FloatArray:
-        state, inputs = explained(balance.solution(force))
-        driven = balance.under(forward.with_part(inputs).fine_motion(balance.ports, state))
-        return driven.law_forces(*driven.motion(force))
-
+        state, whitened = smoother.explained(smoother.base)
+        inputs = SmoothedInputs(_with_shift(problem.part, smoother.shift(whitened)))
+        return replace(point, state=state), Working(smoother.whitener, inputs, forward.plant)
+    answer = _Answer.of(smoother, balance)
     start = (
         np.column_stack(point.warm_start)
         if point.warm_start
-        else along(np.zeros((len(balance.d0), len(balance.terms))))
+        else answer(np.zeros((len(balance.d0), len(balance.terms))))
     )
-    force, _ = fixed_point(along, start, _FOLLOWED)
-    state, inputs = explained(balance.solution(force))
-    working = Working(whitener, SmoothedInputs(inputs, force), forward.plant)
-    return replace(point, state=state, warm_start=tuple(force.T)), working
+    force, _ = fixed_point(answer, start, _FOLLOWED)
+    problem.count(_COSTLY * balance.evaluations)
+    state, whitened = smoother.explained(answer.whitened(*problem.part.grid.split_law_forces(force)))
+    inputs = SmoothedInputs(_with_shift(problem.part, smoother.shift(whitened)), force)
+    return replace(point, state=state, warm_start=tuple(force.T)), Working(smoother.whitener, inputs, forward.plant)
+
+
+@dataclass(frozen=True)
+class _Smoother:
+    """The smoother of a model's inputs, and its initial state, by the whitened residual (F, S)."""
+
+    problem: Problem
+    forward: Forward
+    whitener: Whitener  # of the present plant
+    free: ComplexArray  # whitened free motion per state at the first sample, (F, S, 2n)
+    of_residual: FloatArray  # state by the packed residual, (2n, 2 F S)
+    base: ComplexArray  # whitened residual without laws and free motion
+
+    @classmethod
+    def of(cls, problem: Problem, forward: Forward) -> _Smoother:
+        whitener, band = Whitener.of(forward, problem.noise), problem.part.grid.band
+        free = whitener.factor @ problem.free_columns(forward)[band]
+        columns = problem.part.grid.pack(free)
+        scale = scale_of(columns.T @ columns, columns.shape[1])
+        of_residual = scale[:, None] * np.linalg.pinv(columns * scale, rcond=1e-9)
+        rest = (problem.part.sensors - problem.shown(forward, None))[band]
+        return cls(problem, forward, whitener, free, of_residual, (whitener.factor @ rest[:, :, None])[:, :, 0])
+
+    def explained(self, whitened: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+        """The initial state (2n,) that explains most of a whitened residual, and what it leaves, (F, S)."""
+        state = self.of_residual @ self.problem.part.grid.pack(whitened)
+        return state, whitened - self.free @ state
+
+    def shift(self, whitened: ComplexArray) -> ComplexArray:
+        """Change of the inputs by what is left, (F, supports + forces)."""
+        return _shift(self.whitener, whitened, self.problem.part.support.shape[1])
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """Forces of laws (4N, m) along the motion that others make under inputs smoothed beside them.
+
+    All but the laws is linear: the response to the measured inputs, to their shift and to the laws' forces.
+    """
+
+    smoother: _Smoother
+    balance: HarmonicBalance
+    of_spectrum: ComplexArray  # whitened sensor signals per transformed force, (F, S, m)
+    of_line: ComplexArray  # the same per polynomial force, (F, S, 2, m)
+    deflection: ComplexArray  # along the ports under the measured inputs, (F', m), periodic part
+    polynomial: FloatArray  # the same, polynomial part, (DEGREE + 1, m)
+    by_inputs: ComplexArray  # deflection per shift of the inputs, (F, m, supports + forces)
+    by_steady: FloatArray  # the same per steady force, (DEGREE + 1, m, forces)
+    rows: FloatArray  # deflections, then rates, per state, (2m, 2n)
+
+    @classmethod
+    def of(cls, smoother: _Smoother, balance: HarmonicBalance) -> _Answer:
+        forward, plant, grid = smoother.forward, balance.plant, balance.grid
+        band, factor, wide, s = grid.band, smoother.whitener.factor, balance.wide, plant.structure
+        shown = plant.sensor_of_force[band] @ wide.T * forward.sensor_factor[band, :, None]
+        sensors, none = len(s.sensor_kind), np.zeros_like(forward.part.sensors)
+        still = np.zeros_like(forward.part.support_polynomial)
+        resting = forward.shown(none, np.zeros((DEGREE + 1, sensors)))
+        lines = np.empty((len(grid.omega), sensors, 2, len(balance.terms)), dtype=complex)
+        for b, port in enumerate(wide):
+            for k in range(2):
+                line = np.zeros((DEGREE + 1, len(s.H)))
+                line[k] = port
+                seen = plant.polynomial_sensors(balance.lines[b, k], still, line)
+                lines[:, :, k, b] = forward.shown(none, seen) - resting
+        gains = np.concatenate([forward.support_gain, forward.force_faults[0]])
+        load = np.zeros((DEGREE + 1, *s.F.shape))
+        load[0] = s.F / forward.force_faults[0]
+        steady = np.stack([plant.polynomial_response(load[..., i]) for i in range(s.F.shape[1])], axis=2)
+        return cls(
+            smoother,
+            balance,
+            factor @ shown / (OVERSAMPLING * np.sqrt(grid.samples)),
+            (factor @ lines[band].reshape(len(factor), sensors, -1)).reshape(len(factor), sensors, 2, -1),
+            forward.linear_deflection @ wide.T,
+            forward.polynomial[1] @ wide.T,
+            wide @ plant.deflection_of_inputs[band] / gains,
+            np.einsum("pni,mn->pmi", steady, wide @ s.H),
+            s.motion_rows(wide),
+        )
+
+    def whitened(self, spectrum: ComplexArray, line: FloatArray) -> ComplexArray:
+        """Whitened residual beside forces, split into a transform and a polynomial, without free motion."""
+        seen = (self.of_spectrum @ spectrum[: len(self.of_spectrum), :, None])[:, :, 0]
+        return np.asarray(self.smoother.base - seen - np.einsum("fskb,kb->fs", self.of_line, line[:2]))
+
+    def __call__(self, force: FloatArray) -> FloatArray:
+        balance, grid, forward = self.balance, self.balance.grid, self.smoother.forward
+        spectrum, line = grid.split_law_forces(force)
+        state, left = self.smoother.explained(self.whitened(spectrum, line))
+        shift = self.smoother.shift(left)
+        supports = forward.part.support.shape[1]
+        steady = np.real(shift[0, supports:]) / np.sqrt(grid.samples)
+        shift[0, supports:] = 0.0
+        deflection = self.deflection.copy()
+        deflection[grid.band] += (self.by_inputs @ shift[:, :, None])[:, :, 0]
+        polynomial = self.polynomial + self.by_steady @ steady
+        driven = balance.under(_fine_motion(self, deflection, polynomial, state))
+        balance.evaluations += len(balance.terms)
+        return driven.law_forces(*driven.motion_of(spectrum, line))
+
+
+def _fine_motion(
+    answer: _Answer, deflection: ComplexArray, polynomial: FloatArray, state: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Deflection and rate along the ports, each (4N, m), of their parts and of an initial state."""
+    balance, grid = answer.balance, answer.balance.grid
+    count, size = len(balance.d0), OVERSAMPLING * np.sqrt(grid.samples)
+    swinging = irfft(np.stack([deflection.T, 1j * grid.omega * deflection.T]), count) * size
+    A = balance.plant.structure.state_matrix()
+    free = propagate(A, answer.rows, state, grid.step / OVERSAMPLING, count)
+    d, v = swinging.transpose(0, 2, 1)
+    m = len(balance.terms)
+    d = d + balance.powers @ polynomial + free[:, :m]
+    return d, v + balance.powers @ balance.plant.derivative(polynomial) + free[:, m:]
 
 
 def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
     """The part with inputs smoothed by a residual (F, S)."""
-    band = part.grid.band
-    whitened = (whitener.factor @ spectrum[band, :, None])[:, :, 0]
+    whitened = (whitener.factor @ spectrum[part.grid.band, :, None])[:, :, 0]
+    return _with_shift(part, _shift(whitener, whitened, part.support.shape[1]))
+
+
+def _shift(whitener: Whitener, whitened: ComplexArray, supports: int) -> ComplexArray:
+    """Change of the inputs by a whitened residual (F, S), (F, supports + forces)."""
     size = np.mean(np.abs(whitened) ** 2, axis=1)
     local = np.convolve(np.pad(size, _WIDTH // 2, mode="edge"), np.ones(_WIDTH) / _WIDTH, mode="valid")
-    shift = np.einsum("fis,fs->fi", whitener.smoother_gain, whitened)
-    support, force = part.support.copy(), part.force.copy()
+    shift = (whitener.smoother_gain @ whitened[:, :, None])[:, :, 0]
+    shift[:, :supports] /= np.maximum(1.0, local)[:, None]
+    return np.asarray(shift)
+
+
+def _with_shift(part: Part, shift: ComplexArray) -> Part:
+    """The part with inputs shifted."""
+    support, force, band = part.support.copy(), part.force.copy(), part.grid.band
     count = support.shape[1]
-    support[band] += shift[:, :count] / np.maximum(1.0, local)[:, None]
+    support[band] += shift[:, :count]
     force[band] += shift[:, count:]
     steady = (
         part.force_polynomial.copy()

@@ -20,6 +20,7 @@ from sprung.model.laws.basis import StaticLaw
 from sprung.model.signals import FloatArray
 
 _KRYLOV, _FINE_KRYLOV, _KRYLOV_TOLERANCE = 16, 60, 3e-3
+_CANCELLED = 0.5  # of a vector's length, from which it is made orthogonal once more
 _BLOCK = 8  # columns that are solved for together on the oversampled axis, which bounds the memory
 _RELATIVE_STEP = 1e-4  # of finite differences
 
@@ -160,8 +161,10 @@ def tangent(
     correction: SmootherCorrection | None,
     *,
     fine: bool = False,
-) -> ComplexArray:
+) -> tuple[ComplexArray, float]:
     """Spectra (F, m, columns) of the laws' reaction to small motions along their ports.
+
+    The second is the work: evaluations of one law along the oversampled record that cost as much.
 
     The tangent along the trajectory less the equivalent, which is part of the plant, in closed loop with the plant:
     f = s (d0 + D f) with the slopes s over time, solved for all columns at once.  Laws with memory have no
@@ -177,86 +180,115 @@ def tangent(
     compliance = plant.compliance(ports, ports)
     if correction is not None:
         compliance[grid.band] -= correction.deflection @ correction.seen
-    jw = 1j * grid.omega[:, None, None]
-    if not plant.floats:  # single precision suffices for a tolerance of a few thousandths
-        slopes, motions = slopes.astype(np.float32), motions.astype(np.float32)
-        compliance, jw = compliance.astype(np.complex64), jw.astype(np.complex64)
+    if plant.floats:
+        return _floating_tangent(forward, ports, slopes, motions, correction)
+    # single precision suffices for a tolerance of a few thousandths; time is last, where transforms are contiguous
+    along = slopes.transpose(0, 2, 1).astype(np.float32)[:, None]  # (2, 1, m, N)
+    moving = motions.transpose(0, 3, 2, 1).astype(np.float32)  # (2, columns, m, N)
+    right = np.ascontiguousarray(np.sum(along * moving, axis=0))
+    compliance = np.ascontiguousarray(compliance.transpose(1, 2, 0)).astype(np.complex64)  # (m, m, F)
+    jw = (1j * grid.omega).astype(np.complex64)
+
+    def close(force: FloatArray) -> FloatArray:
+        moved = np.einsum("abf,cbf->caf", compliance, rfft(force))
+        d, v = irfft(np.stack([moved, jw * moved]), grid.samples)
+        return np.asarray(force - along[0] * d - along[1] * v)
+
+    found, steps = _gmres(close, right)
+    return grid.forward(found.astype(np.float64).transpose(2, 1, 0)), steps * len(right) * len(ports) / OVERSAMPLING
+
+
+def _floating_tangent(
+    forward: Forward,
+    ports: FloatArray,
+    slopes: FloatArray,
+    motions: FloatArray,
+    correction: SmootherCorrection | None,
+) -> tuple[ComplexArray, float]:
+    """As `tangent`, of a system that nothing holds: forces have polynomial parts, too."""
+    grid = forward.part.grid
     along_d, along_v = slopes[0, :, :, None], slopes[1, :, :, None]
 
     def close(force: FloatArray) -> FloatArray:
-        if plant.floats:
-            spectrum = grid.forward(force)
-            d, v = _floating(forward, ports, ports, spectrum)
-            if correction is not None:
-                d, v = (d, v) - correction.motion(correction.seen @ spectrum[grid.band])
-            found: FloatArray = force - along_d * d - along_v * v
-            return found
-        moved = compliance @ grid.forward(force)
-        return force - along_d * grid.inverse(moved) - along_v * grid.inverse(jw * moved)
+        force = force.transpose(2, 1, 0)
+        spectrum = grid.forward(force)
+        d, v = _floating(forward, ports, ports, spectrum)
+        if correction is not None:
+            d, v = (d, v) - correction.motion(correction.seen @ spectrum[grid.band])
+        return np.ascontiguousarray((force - along_d * d - along_v * v).transpose(2, 1, 0))
 
-    return grid.forward(_gmres(close, along_d * motions[0] + along_v * motions[1]).astype(np.float64))
+    right = np.ascontiguousarray((along_d * motions[0] + along_v * motions[1]).transpose(2, 1, 0))
+    found, steps = _gmres(close, right)
+    return grid.forward(found.transpose(2, 1, 0)), steps * len(right) * len(ports) / OVERSAMPLING
 
 
-def _fine_tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> ComplexArray:
+def _fine_tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> tuple[ComplexArray, float]:
     """As `tangent`, on the oversampled axis, for one force along each distinct port."""
     grid, plant = forward.part.grid, forward.plant
     _, first, place = np.unique(forces.ports, axis=0, return_index=True, return_inverse=True)
     each = np.stack([_fine_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=1).astype(np.float32)
-    each = each[..., None]  # (2, m, 4N, 1)
-    slopes = np.stack([each[:, place == k].sum(axis=1) for k in range(len(first))], axis=1)  # (2, u, 4N, 1)
+    slopes = np.stack([each[:, place == k].sum(axis=1) for k in range(len(first))], axis=1)  # (2, u, 4N)
     count = OVERSAMPLING * grid.samples
     balance = forward.harmonic_balance(np.zeros(plant.structure.states))
     assert balance is not None, "there are laws"
-    compliance = balance.compliance[:, first[:, None], first].astype(np.complex64)
-    jw = balance.jw[:, None].astype(np.complex64)
+    compliance = balance.compliance[:, first[:, None], first].transpose(1, 2, 0)
+    compliance, jw = np.ascontiguousarray(compliance).astype(np.complex64), balance.jw.astype(np.complex64)
 
     def moved(force: FloatArray) -> FloatArray:
-        answer = np.einsum("fab,bfc->afc", compliance, rfft(force, axis=1))
-        return np.asarray(irfft(np.stack([answer, jw * answer]), count, axis=2))
+        answer = np.einsum("abf,cbf->caf", compliance, rfft(force))
+        return np.asarray(irfft(np.stack([answer, jw * answer]), count))
 
     def close(force: FloatArray) -> FloatArray:
-        return np.asarray(force - np.sum(slopes * moved(force), axis=0))
+        return np.asarray(force - np.sum(slopes[:, None] * moved(force), axis=0))
 
-    def reaction(motion: FloatArray) -> ComplexArray:
+    def reaction(motion: FloatArray) -> tuple[ComplexArray, float]:
         spline = CubicSpline(np.arange(grid.samples), motion[:, :, first], axis=1)
-        along = spline(np.arange(count) / OVERSAMPLING).astype(np.float32).transpose(0, 2, 1, 3)  # (2, u, 4N, columns)
-        force = _gmres(close, np.sum(slopes * along, axis=0), _FINE_KRYLOV)
-        result = np.sum(each * (along + moved(force))[:, place], axis=0)
-        return grid.coarse_forces(result.transpose(1, 0, 2).astype(np.float64))
+        along = spline(np.arange(count) / OVERSAMPLING).astype(np.float32).transpose(0, 3, 2, 1)  # (2, columns, u, 4N)
+        force, steps = _gmres(close, np.sum(slopes[:, None] * along, axis=0), _FINE_KRYLOV)
+        result = np.sum(each[:, None] * (along + moved(force))[:, :, place], axis=0)
+        return grid.coarse_forces(result.transpose(2, 1, 0).astype(np.float64)), steps * force.shape[0] * force.shape[1]
 
     columns = motions.shape[3]
-    return np.concatenate([reaction(motions[..., at : at + _BLOCK]) for at in range(0, columns, _BLOCK)], axis=2)
+    parts, work = zip(*(reaction(motions[..., at : at + _BLOCK]) for at in range(0, columns, _BLOCK)), strict=True)
+    return np.concatenate(parts, axis=2), sum(work)
 
 
-def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray, krylov: int = _KRYLOV) -> FloatArray:
-    """Solution x of apply(x) = right by GMRES for all last-axis columns at once (Saad and Schultz 1986)."""
-    size = np.sqrt(np.sum(right**2, axis=(0, 1)))
+def _gmres(
+    apply: Callable[[FloatArray], FloatArray], right: FloatArray, krylov: int = _KRYLOV
+) -> tuple[FloatArray, int]:
+    """Solution x of apply(x) = right, and the steps it took.
+
+    GMRES for all columns, of the first axis, at once (Saad and Schultz 1986).
+    """
+    columns, flat = len(right), right.reshape(len(right), -1)
+    size = np.linalg.norm(flat, axis=1)
     used = size > 0
     if not used.any():
-        return right
-    scale = np.where(used, size, 1.0)
-    basis = [right / scale]
-    columns = len(scale)
+        return right, 0
+    basis = np.empty((columns, krylov + 1, flat.shape[1]), right.dtype)
+    basis[:, 0] = flat / np.where(used, size, 1.0)[:, None]
     hessenberg = np.zeros((columns, krylov + 1, krylov), right.dtype)
     target = np.zeros((columns, krylov + 1, 1), right.dtype)
     target[:, 0, 0] = size
     for k in range(krylov):
-        w = apply(basis[k])
-        for j, v in enumerate(basis):
-            h = np.einsum("nmc,nmc->c", w, v)
-            hessenberg[:, j, k] = h
-            w = w - h * v
-        length = np.sqrt(np.sum(w**2, axis=(0, 1)))
+        w = apply(basis[:, k].reshape(right.shape)).reshape(flat.shape)
+        known, length = basis[:, : k + 1], np.linalg.norm(w, axis=1)
+        for _ in range(2):  # the second time where much was taken away (Daniel et al. 1976)
+            before = length
+            along = known @ w[:, :, None]
+            w = w - (along.transpose(0, 2, 1) @ known)[:, 0]
+            hessenberg[:, : k + 1, k] += along[:, :, 0]
+            length = np.linalg.norm(w, axis=1)
+            if np.all(length[used] > _CANCELLED * before[used]):
+                break
         hessenberg[:, k + 1, k] = length
         solved = np.linalg.pinv(hessenberg[:, : k + 2, : k + 1]) @ target[:, : k + 2]
         left = target[:, : k + 2] - hessenberg[:, : k + 2, : k + 1] @ solved
         if np.max(np.linalg.norm(left[:, :, 0], axis=1)[used] / size[used]) < _KRYLOV_TOLERANCE:
             break
-        basis.append(w / np.where(length > 1e-12, length, 1.0))
-    result = np.zeros_like(right)
-    for j in range(solved.shape[1]):
-        result += basis[j] * solved[:, j, 0]
-    return result
+        basis[:, k + 1] = w / np.where(length > 1e-12, length, 1.0)[:, None]
+    found = solved.transpose(0, 2, 1) @ basis[:, : solved.shape[1]]
+    return np.asarray(found.reshape(right.shape)), k + 1
 
 
 def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:

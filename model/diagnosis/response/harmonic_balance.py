@@ -151,7 +151,10 @@ class HarmonicBalance:
 
     def motion(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflection and rate along the ports under forces (4N, m), each (4N, m)."""
-        spectrum, line = self.grid.split_law_forces(force)
+        return self.motion_of(*self.grid.split_law_forces(force))
+
+    def motion_of(self, spectrum: ComplexArray, line: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The same under forces that are split into a transform (2N + 1, m) and a polynomial (DEGREE + 1, m)."""
         answer = np.einsum("fab,fb->af", self.compliance, spectrum)
         swinging = irfft(np.stack([answer, self.jw * answer]), len(self.d0))  # one transform of contiguous series
         steady = np.einsum("kpab,kb->pa", self.line_d, line[:2])
