@@ -57,12 +57,19 @@ class FaultsChanged(RuntimeError):
 NO_EXCITATION = "no excitation: standstill, or too slow to tell anything"
 
 
+def lost_channels(names: Sequence[str]) -> str:
+    """Why a window of a vehicle that runs tells nothing, though its channels `names` are all that is wrong."""
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return f"tells nothing without {names[0]}{more}, or at this speed"
+
+
 def outcome_of(window: Window, estimate: Estimate | None) -> tuple[str, str | None]:
     """A window's outcome with the reason for it, once it is known."""
     if estimate is None:
         return window.outcome, window.reason
     if not estimate.informative:
-        return "uninformative", NO_EXCITATION
+        lost = list(dict.fromkeys(fault.channel for fault in estimate.faults)) if estimate.running else []
+        return "uninformative", lost_channels(lost) if lost else NO_EXCITATION
     return (window.outcome if estimate.identified else "dropped"), estimate.reason or window.reason
 
 

@@ -47,7 +47,7 @@ def hints(
             advice = "Go back to another model under Model, or leave laws out of this one"
         text = f"Most often: {why}. {advice}."
         found.append(Hint("warning", "Most windows are dropped", text))
-    if every and row.windows["uninformative"] > MOSTLY * every:
+    if every and row.windows["uninformative"] > MOSTLY * every and not _all_lost(view):
         text = (
             "The track or the speed excites the suspension too little: standstill, or very smooth track. Nothing to do."
         )
@@ -134,7 +134,20 @@ def _sensors(sensors: Mapping[str, Mark], active: Sequence[AlarmRow]) -> list[Hi
     return found
 
 
+def _all_lost(view: VehicleView) -> bool:
+    """Whether not one parameter is identifiable while channels are lost."""
+    return bool(view.parameters) and all(p.lost_with is not None for p in view.parameters)
+
+
 def _parameters(row: FleetRow, view: VehicleView, whole: int) -> list[Hint]:
+    if _all_lost(view):
+        missing = list(dict.fromkeys(c for p in view.parameters for c in str(p.lost_with).split("|")))
+        more = f" and {len(missing) - 1} more are" if len(missing) > 1 else " is"
+        text = (
+            "What is left of the measurements tells no spring or damper; values are those of before. Repair the node "
+            "that sends these channels; no alarm of a spring or damper can come until then."
+        )
+        return [Hint("alarm", f"Not monitored while {missing[0]}{more} lost", text)]
     found = []
     lost = [p for p in view.parameters if p.lost_with is not None]
     for channels in dict.fromkeys(p.lost_with for p in lost):

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sprung.model.signals import BuiltOtherwise
+import numpy as np
+
+from sprung.model.identifier import without_values
+from sprung.model.signals import BuiltOtherwise, MeasurementFault, Window
 from sprung.model.system import load_system
 from sprung.model.tracking.state import Alarm
+from sprung.service.monitoring.processed import NO_EXCITATION, outcome_of
 from sprung.service.monitoring.views import ParameterView, VehicleView, suspected
 from sprung.service.pages.vehicle import sensor_marks
 from sprung.service.rendering.drawing import Mark
@@ -81,3 +85,26 @@ def test_an_element_is_said_to_be_unidentifiable_because_of_a_lost_input() -> No
     )
     assert spring.as_dict()["lost_with"] == channels and spring.state == "not_identifiable"
     assert "lost_with" not in known.as_dict()
+
+
+def test_a_vehicle_without_its_inputs_is_said_not_to_be_monitored_rather_than_to_stand() -> None:
+    channels = "wheel_11r.displacement|wheel_11r.velocity|wheel_12l.displacement"
+    spring = ParameterView(
+        "primary_11r.stiffness", "primary_11r", "stiffness", "N/m", 1.0, 1.0, 0.1, False, 1.0, 0.0, 0.1, None, channels
+    )
+    row = replace(ROW, windows=WINDOWS | {"used": 2, "uninformative": 90})
+    lost = replace(VIEW, alarms=(), parameters=(spring, replace(spring, name="primary_11l.stiffness")))
+    (said,) = hints(row, lost, [], [], False, {})
+    assert (said.level, said.title) == ("alarm", "Not monitored while wheel_11r.displacement and 2 more are lost")
+    (stands,) = hints(row, replace(lost, parameters=()), [], [], False, {})
+    assert stands.title == "Uninformative"
+
+
+def test_a_window_says_that_channels_are_missing_rather_than_that_the_vehicle_stands() -> None:
+    window = Window(0, 100.0, np.zeros((2, 3)))
+    stands = without_values(2, 3)
+    silent = tuple(MeasurementFault(f"wheel_11l.{what}", "silent", 0.0) for what in ("displacement", "velocity"))
+    assert outcome_of(window, stands) == ("uninformative", NO_EXCITATION)
+    moved = replace(stands, running=True, faults=silent)
+    assert outcome_of(window, moved)[1] == "tells nothing without wheel_11l.displacement and 1 more, or at this speed"
+    assert outcome_of(window, replace(moved, faults=()))[1] == NO_EXCITATION
