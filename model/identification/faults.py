@@ -38,6 +38,9 @@ _EVIDENT = 12.5  # log-likelihood ratio of such a step: five standard deviations
 _BETTER = 0.8  # a correction that leaves more of chi-square than this is none
 _MARGIN = 2  # samples that a delay costs at either end beyond itself
 _LATE = (-0.045, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.045)  # s: delays too large for a linear step
+_SET_ANEW = 0.2  # of a window: what is left of it, once a delay is taken back from both ends, still tells
+_FAR_TRIED = 2  # windows of a batch, as many as it takes to have something in common
+_APART = 0.015  # s between delays that are tried: half a period of what moves at 30 Hz
 _LATE_TRIED = 3  # windows of a batch that they are tried on; others begin with what these have in common
 _TRIALS = 3  # of such delays, reversed signs or exchanges, by their squares at the nominal values
 _TOLERATED = 3.0  # of what a data sheet leaves open; channels that are all off by less are none of them wrong
@@ -102,6 +105,8 @@ class Explainer:
         whole = [(late[:, self.groups == group] > 0).all(axis=1) for group in np.unique(self.groups)]
         alone = (late > 0).sum(axis=1) == np.array([[np.sum(self.groups == g)] for g in np.unique(self.groups)])
         self._clocks = self.directions[(np.array(whole) & alone).any(axis=0)]  # one delay for each clock
+        parts = [(late[:, self.groups == group] > 0).any(axis=1) for group in np.unique(self.groups)]
+        self._of_clocks = self.directions[(late > 0).any(axis=1) & (np.array(whole) == np.array(parts)).all(axis=0)]
 
     def _directions(self) -> FloatArray:
         """Simple explanations as rows over the deviations: each alone, and what several channels have in common."""
@@ -261,7 +266,7 @@ class Explainer:
             if i not in found:
                 strong = self._turned(window)
                 if strong is None and late < _LATE_TRIED:
-                    strong, late = self._late(window), late + 1
+                    strong, late = self._late(window, far=late < _FAR_TRIED), late + 1
                 if strong is not None:
                     found[i] = strong
         return {int(names[i]): explained for i, explained in found.items()}
@@ -478,13 +483,31 @@ class Explainer:
                 return explained[0]
         return None
 
-    def _late(self, window: FloatArray) -> FaultExplanation | None:
-        """One window with a channel, or all of a clock, that is late or early by many samples put right."""
+    def _late(self, window: FloatArray, *, far: bool) -> FaultExplanation | None:
+        """One window (T, C) with a channel, or all of a clock, that is late or early by many samples put right.
+
+        far: clocks by very many, too.
+        """
         C = self.channels
         rows = [row for row in self.directions if row[C : 2 * C].any()]
-        points = np.array([np.zeros(len(self.deviations)), *(row * late for row in rows for late in _LATE)])
-        edge = int(np.ceil(max(_LATE) * self.system.sample_rate)) + _MARGIN
-        if self.samples <= 4 * edge:
+        found = self._late_by(window, rows, _LATE)
+        return found if found is not None or not far else self._late_by(window, self._of_clocks, self._far)
+
+    @property
+    def _far(self) -> tuple[float, ...]:
+        """Delays, s, of a clock that was set anew: beyond those that electronics and filters have."""
+        most = _SET_ANEW * self.samples / self.system.sample_rate
+        later = np.arange(max(_LATE) + _APART, most, _APART)
+        return (*-later[::-1], *later)
+
+    def _late_by(
+        self, window: FloatArray, rows: Sequence[FloatArray] | FloatArray, lates: Sequence[float]
+    ) -> FaultExplanation | None:
+        """One window (T, C) with channels, of `rows` over the deviations, that are late by one of `lates`, s, put
+        right."""
+        points = np.array([np.zeros(len(self.deviations)), *(row * late for row in rows for late in lates)])
+        edge = int(np.ceil(max(lates, default=0.0) * self.system.sample_rate)) + _MARGIN
+        if self.samples <= 4 * edge or len(points) == 1:
             return None
         restored = self.corrected(np.repeat(window[None], len(points), axis=0), points)
         costs = self._nominal_cost(restored[:, edge : self.samples - edge])
