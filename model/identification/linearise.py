@@ -310,7 +310,7 @@ class WindowModel:
         return Chord(cost, step.squeeze(2), released.squeeze(2), x0, error, r, outputs, states)
 
     def objective(self, x: Tensor, cost: Tensor) -> Tensor:
-        """What an iteration lowers, (B,): weighted squares `cost` and those of the log-ratios x (B, P) that are held."""
+        """What an iteration lowers, (B,): weighted squares `cost`, and those of log-ratios x (B, P) that it holds."""
         return cost + (x.square() * self.held[: x.shape[1]]).sum(dim=1)
 
     def simulated(self, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:

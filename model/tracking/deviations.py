@@ -23,8 +23,8 @@ TREND_MOST = 2.0  # deviations of one of them at most: one window is no drift
 LINEARISATION_ERROR = 0.5  # of the square of a gain: error of a window that was linearised without correcting the gain
 CORRECTED_GAIN = 0.06  # gain from which windows are corrected before they are linearised
 UNLIKE_DATA_SHEET = 4.0  # times its tolerance: standard deviation of a gain (6 %), or a delay (8 ms), of a defect
-LIKELY_DEFECT = 1.0  # log-likelihood ratio of a defect: little is lost where there is none
-DEFECTIVE = 3  # channels at most: the others must tell what is right
+LIKELY_DEFECT = 1.0  # log-likelihood ratio of a defect; little is lost where there is none
+DEFECTIVE = 0.3  # of the channels at most: the others must tell what is right
 STOPPED = 5.0  # s without a used window after which passengers may have boarded
 
 
@@ -40,7 +40,6 @@ class DeviationRecord:
     followed: FloatArray  # the belief that the reference has followed last, shape (H,)
     lately: FloatArray  # how far the reference has followed over the last LATELY windows, shape (H,)
     moved: FloatArray  # 1 where a deviation has jumped, or drifted away, since, shape (H,)
-    defective: FloatArray  # 1 where what the data sheet of a channel says counts no longer, shape (H,)
     origin: FloatArray  # gains and delays when they were first known, shape (H,); NaN: not yet
     slope: FloatArray  # recent evidence for a jump along each direction, shape (V,)
     curvature: FloatArray  # its information, shape (V,)
@@ -72,7 +71,6 @@ def start(parameters: int, model: DeviationModel) -> DeviationRecord:
         followed=zeros(H),
         lately=zeros(H),
         moved=zeros(H),
-        defective=zeros(H),
         origin=np.full(H, np.nan),
         slope=zeros(V),
         curvature=zeros(V),
@@ -104,7 +102,7 @@ def extended(record: DeviationRecord, belief: Belief, model: DeviationModel) -> 
     fresh = start(len(record.cross), model)
     longer = {
         name: np.append(getattr(record, name), getattr(fresh, name)[old:])
-        for name in ("reference", "reference_variance", "following", "followed", "lately", "moved", "defective", "origin")
+        for name in ("reference", "reference_variance", "following", "followed", "lately", "moved", "origin")
     }
     return (
         replace(record, **wider, **longer),
@@ -170,7 +168,6 @@ def update(
     covariance = belief.covariance - across @ curvature @ across.T
     covariance = 0.5 * (covariance + covariance.T)
     belief = replace(belief, mean=belief.mean + across @ slope, covariance=covariance)
-    calibration, belief = _without_data_sheets(calibration, model, belief)
     mixed = MEMORY if calibration.recent[-1] else 1.0
     return (
         replace(
@@ -183,47 +180,6 @@ def update(
         jump,
         agrees,
     )
-
-
-def _without_data_sheets(
-    record: DeviationRecord, model: DeviationModel, belief: Belief
-) -> tuple[DeviationRecord, Belief]:
-    """Record and belief in which the data sheet of a defective channel counts no longer.
-
-    Held by a tolerance of 1.5 %, a gain that has been 1.05 from the beginning would seem to be 1.035, and the rest to be
-    in other channels and bodies.  The tolerance of a channel for which a defect is likelier is taken back out of the
-    belief, exactly.  Where it has held the belief, it has held the reference of the baseline as well, and has made a
-    jump seem likely.
-    """
-    H, at = model.size, model.of_channels
-    if not len(at) or np.count_nonzero(record.defective) >= DEFECTIVE:
-        return record, belief
-    sheet, own = model.prior_information[:, at], model.prior_information[at, at]
-    wide = UNLIKE_DATA_SHEET**2 * model.prior.diagonal()[at]
-    taken = wide / (1 + wide * own)  # of the information along each column of `sheet`
-    moved = belief.covariance[:, -H:] @ sheet
-    along, left = belief.mean[-H:] @ sheet, np.maximum(1 - taken * (sheet * moved[-H:]).sum(axis=0), 1e-9)
-    gained = 0.5 * taken * along**2 / left - 0.5 * np.log((1 + wide * own) * left)
-    best = int(np.argmax(np.where((record.defective + record.moved)[at] > 0, -np.inf, gained)))
-    if gained[best] < LIKELY_DEFECT or (record.defective + record.moved)[at[best]] > 0:
-        return record, belief
-    size = taken[best] / left[best]
-    shift = moved[:, best] * size * along[best]
-    covariance = belief.covariance + size * np.outer(moved[:, best], moved[:, best])
-    by = np.where(model.refined, 0.0, shift[-H:])
-    none = np.zeros_like(record.slope)
-    record = replace(
-        record,
-        slope=none,
-        curvature=none,
-        trend=none,
-        trend_curvature=none,
-        defective=np.maximum(record.defective, np.arange(H) == at[best]),
-        reference=record.reference + by,
-        followed=record.followed + by,
-        origin=record.origin + by,
-    )
-    return record, replace(belief, mean=belief.mean + shift, covariance=covariance)
 
 
 def faded(record: DeviationRecord, model: DeviationModel, belief: Belief, added: FloatArray) -> DeviationRecord:
@@ -355,6 +311,34 @@ def _drift_opened(record: DeviationRecord, model: DeviationModel, belief: Belief
     along[-model.size :], along[: belief.size] = lag, record.cross @ lag
     opened = replace(belief, covariance=belief.covariance + np.outer(along, along))
     return faded(record, model, belief, lag**2), opened
+
+
+def without_data_sheets(
+    record: DeviationRecord, model: DeviationModel, belief: Belief
+) -> tuple[FloatArray, FloatArray]:
+    """Deviations (H,) and their covariance (H, H) as they are told, where channels may be defective.
+
+    Held by a tolerance of 1.5 %, a gain that has been 1.05 from the beginning would seem to be 1.035, and the rest in
+    other channels.  The tolerance of a channel for which a defect is likelier is therefore taken back out of the
+    belief, as far as it is still in it (`following`); a jump has left none.
+    """
+    H, at = model.size, model.of_channels
+    mean, covariance = belief.mean[-H:], belief.covariance[-H:, -H:]
+    sheet, own = model.prior_information[:, at], model.prior_information[at, at]
+    wide = UNLIKE_DATA_SHEET**2 * model.prior.diagonal()[at]
+    taken = np.where(record.moved[at] > 0, 0.0, record.following[at]) * wide / (1 + wide * own)
+    for _ in range(int(DEFECTIVE * model.gains.sum())):
+        along, moved = mean @ sheet, covariance @ sheet
+        left = np.maximum(1 - taken * (sheet * moved).sum(axis=0), 1e-9)
+        gained = 0.5 * taken * along**2 / left - 0.5 * np.log((1 + wide * own) * left)
+        best = int(np.argmax(gained))
+        if gained[best] < LIKELY_DEFECT:
+            break
+        size = taken[best] / left[best]
+        mean = mean + moved[:, best] * size * along[best]
+        covariance = covariance + size * np.outer(moved[:, best], moved[:, best])
+        taken = taken * (np.arange(len(at)) != best)
+    return mean, covariance
 
 
 def linearisation_std(gain: FloatArray) -> FloatArray:

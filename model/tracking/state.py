@@ -226,7 +226,6 @@ def _calibration(data: Mapping[str, Any]) -> DeviationRecord:
     unknown = np.full(size, np.nan)  # `deviations.extended` knows what older states leave open
     of_reference = ("origin", "reference_variance", "following", "followed", "lately")
     older: dict[str, Any] = {name: unknown for name in of_reference} | {"trend": none, "trend_curvature": none}
-    older["defective"] = np.zeros(size)
     shape = len(data["names"]), size
     return DeviationRecord(**older | arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
 

@@ -175,13 +175,15 @@ class Tracker:
         A vehicle at standstill counts as monitored.  A running one does not where its inputs show no motion or are
         frozen, or where windows do not fit in a curve (with a zero error of the yaw rate every window is a curve).
         Where it runs too slowly for an estimate, the last one stays valid for a while.  A silent channel tells nothing
-        of whether it runs.
+        of whether it runs; while so many are silent that no window has told anything, it is not monitored.
         """
         speed = np.nan if conditions is None else conditions.speed
         frozen = not estimate.running and any(fault.kind != "silent" for fault in estimate.faults)
         runs = estimate.informative or speed > MOVING or frozen
         known = state.last is not None and (time_ns - state.last) * 1e-9 < self.settings.holding
-        seen = coverage.update(state.coverage, usable=not runs and (known or not estimate.running or speed < CRAWLING))
+        blind = len(self.lost(state)) == len(self.names)  # not too slow, but without its channels
+        still = known or not estimate.running or speed < CRAWLING
+        seen = coverage.update(state.coverage, usable=still and not (runs or blind))
         new = replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
         if estimate.informative or not estimate.faults:
             return new
@@ -340,12 +342,12 @@ class Tracker:
         H = self.model.size
         if H == 0 or state.calibration.recent[-1] == 0:
             return stuck
-        value = state.belief.mean[-H:]
+        value, covariance = dev.without_data_sheets(state.calibration, self.model, state.belief)
         off = value - self.model.common_value(value)
         far = np.abs(off) > self.model.report_limit
         if not far.any():
             return stuck
-        std = self.model.relative_std(state.belief.covariance[-H:, -H:] + self._model_uncertainty[1])
+        std = self.model.relative_std(covariance + self._model_uncertainty[1])
         linear = np.where(self.model.gains, dev.linearisation_std(off), 0.0)
         std = np.sqrt(std**2 + dev.pending_variance(state.calibration, self.model) + linear**2)
         chosen = far & (np.abs(off) > 3 * std)
@@ -353,11 +355,11 @@ class Tracker:
 
     def body_constants(self, state: TrackerState) -> tuple[BuiltOtherwise, ...]:
         """Constants of bodies (inertias over mass, sensor distances) that differ from the system file."""
-        H = self.model.size
-        found = []
+        if not self.model.constant.any():
+            return ()
+        found, (values, covariance) = [], dev.without_data_sheets(state.calibration, self.model, state.belief)
         for h in np.flatnonzero(self.model.constant).tolist():
-            value = float(state.belief.mean[-H:][h])
-            std = float(np.sqrt(state.belief.covariance[-H:, -H:][h, h] + self._model_uncertainty[1][h, h]))
+            value, std = float(values[h]), float(np.sqrt(covariance[h, h] + self._model_uncertainty[1][h, h]))
             if abs(value) > max(self.model.rules.constants, 3 * std):
                 deviation = self.deviations[h]
                 found.append(BuiltOtherwise(deviation.name, OWN[deviation.kind], float(np.expm1(value)), std))

@@ -113,3 +113,17 @@ def test_coarse_inputs_of_a_standing_vehicle_are_no_fault(system: System) -> Non
     still[:, :, len(system.inputs)] *= 30  # somebody works on the car
     examined = Identifier(system).examine(still, np.zeros(3, dtype=bool))
     assert not any(told.informative or told.faults for told in examined)
+
+
+@pytest.mark.parametrize(("speed", "watched"), [(7.0, True), (30.0, False)])
+def test_a_vehicle_that_is_too_slow_is_watched_for_a_while_and_one_without_its_channels_is_not(
+    speed: float, watched: bool
+) -> None:
+    tracker, state, covariance = learned()
+    lost = tuple(MeasurementFault(f"wheel_{k}", "silent", 0.0) for k in range(4)) if not watched else ()
+    nothing = np.zeros(24, dtype=bool)
+    told = estimate(np.zeros(24), covariance, informative=False, running=True, identifiable=nothing, faults=lost)
+    for k in range(60):
+        state = tracker.update(state, told, EPOCH + (40 + k) * SECOND, Conditions(speed=min(speed, 9.0)))
+    assert state.coverage.monitored == watched
+    assert tracker.health(state) == ("ok" if watched else "check_function")
