@@ -349,7 +349,10 @@ class Tracker:
             return stuck
         std = self.model.relative_std(covariance + self._model_uncertainty[1])
         linear = np.where(self.model.gains, dev.linearisation_std(off), 0.0)
-        std = np.sqrt(std**2 + dev.pending_variance(state.calibration, self.model) + linear**2)
+        # what the belief seems to lack is, as far as it goes, what the data sheet has held back
+        held = np.abs(value - state.belief.mean[-H:])
+        lacking = (np.sqrt(dev.pending_variance(state.calibration, self.model)) - held).clip(0.0)
+        std = np.sqrt(std**2 + lacking**2 + linear**2)
         chosen = far & (np.abs(off) > 3 * std)
         return (*stuck, *named(self.deviations, off, std, chosen))
 
