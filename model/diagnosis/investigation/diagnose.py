@@ -141,8 +141,9 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     fewer = without_refuted(state, final)
     if fewer is not None:
         return concluded(fewer, progress)
-    # what an unconverged fit still promised to fall is as far as its values may yet move
-    moving = 0.0 if final.converged else final.left / final.grain
+    # what an unconverged fit still promised to fall bounds how far its values may yet move: by its last step s,
+    # s_i^2 <= (s^T C^-1 s) C_ii (Cauchy and Schwarz), of the covariance C that noise alone gives
+    moving = 0.0 if final.converged else final.left
     added = form_covariance(state) + shared_gain_covariance(state)
     final = replace(final, covariance=(1 + moving) * final.covariance + added)
     before, after = state.held.runs(state.base.point, state.fit.point)
