@@ -263,7 +263,7 @@ def _gmres(
     columns, flat = len(right), right.reshape(len(right), -1)
     size = np.linalg.norm(flat, axis=1)
     used = size > 0
-    if not used.any():
+    if not used.any() or not np.isfinite(size).all():  # what diverged is judged by its residual
         return right, 0
     basis = np.empty((columns, krylov + 1, flat.shape[1]), right.dtype)
     basis[:, 0] = flat / np.where(used, size, 1.0)[:, None]
@@ -281,6 +281,8 @@ def _gmres(
             length = np.linalg.norm(w, axis=1)
             if np.all(length[used] > _CANCELLED * before[used]):
                 break
+        if not np.isfinite(length).all():
+            return np.full_like(right, np.nan), k + 1
         hessenberg[:, k + 1, k] = length
         solved = np.linalg.pinv(hessenberg[:, : k + 2, : k + 1]) @ target[:, : k + 2]
         left = target[:, : k + 2] - hessenberg[:, : k + 2, : k + 1] @ solved

@@ -132,9 +132,10 @@ def _joint_start(problem: Problem, base: Fit, candidate: Candidate, nominal: boo
         with np.errstate(all="ignore"):
             faint, working = opened(problem, faint, base.whitener)
             lin = linearise(problem, faint, working)
+            finite = np.isfinite(lin.residual).all() and np.isfinite(lin.jacobian).all()
     except np.linalg.LinAlgError:
         return start
-    if not np.all(np.isfinite(lin.residual)) or not np.all(np.isfinite(lin.jacobian)):
+    if not finite:
         return start
     count = len(candidate.term.parameters)
     first = lin.jacobian.shape[1] - len(faint.state) - count

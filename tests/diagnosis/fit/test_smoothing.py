@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import along_measured_motion
+from sprung.model.diagnosis.fit.tangent import tangent
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise, transform
 from sprung.model.diagnosis.response.point import Point
@@ -84,3 +87,15 @@ def test_smoothing_and_sensitivities_count_as_work() -> None:
     linearised = work.done
     assert lin.jacobian.size > 0
     assert 0 < smoothed < linearised < work.done
+
+
+def test_the_reaction_of_laws_to_a_motion_beyond_the_range_of_numbers_is_none() -> None:
+    """Starts of candidates may be that far off: they are dropped, and the diagnosis goes on."""
+    problem, start = problem_of(HELD)
+    point, working = along_measured_motion(problem, start)
+    lin = linearise(problem, replace(point, state=1e60 * np.ones_like(point.state)), working)
+    assert lin.forces is not None
+    motions = np.full((2, 400, 1, 3), 1e60)
+    with np.errstate(all="ignore"):
+        found, _ = tangent(lin.forward, lin.forces, motions, None)
+    assert not np.isfinite(found).any()
