@@ -215,6 +215,7 @@ def test_standstill_is_uninformative_and_raises_nothing(vehicle: System) -> None
     assert not seen.identifiable.any()
 
 
+@pytest.mark.slow
 def test_a_changed_structure_does_not_fit(vehicle: System) -> None:
     rng = np.random.default_rng(9)
     values = record(rng, draw_ride(rng), 60.0)
@@ -223,6 +224,7 @@ def test_a_changed_structure_does_not_fit(vehicle: System) -> None:
     assert not seen.adequate
 
 
+@pytest.mark.slow
 def test_a_measured_speed_is_used_and_a_missing_one_estimated() -> None:
     rng = np.random.default_rng(14)
     ride = draw_ride(rng)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
@@ -75,6 +76,7 @@ def test_the_responses_to_single_inputs_add_up_to_the_window() -> None:
     torch.testing.assert_close(factor @ pushes, task.to_chart(drawn.states[2, 5 : 5 + WINDOW]), rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_known_inputs_are_far_more_informative() -> None:
     task = mass_spring_damper.TASK
     drawn = task.sample(12, np.random.default_rng(1), task.seen)

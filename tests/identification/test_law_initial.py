@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from sprung.model.identification.identify import Identifier, load_identifier
@@ -113,6 +114,7 @@ def test_windows_whose_forces_are_not_those_of_the_law_do_not_fit() -> None:
     assert not any(estimate.adequate for estimate in found)
 
 
+@pytest.mark.slow
 def test_a_law_that_pushes_windows_away_is_no_end_of_the_batch() -> None:
     """Gains and delays are weighed of windows whose motion has not run away."""
     _, values = ride(CUBIC, 4.0)

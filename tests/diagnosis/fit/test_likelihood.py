@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.optimise import optimise
@@ -36,6 +37,7 @@ def test_a_valve_changes_with_the_damper_that_it_belongs_to() -> None:
     assert max(_errors(problem, term, fine=True)) < 0.01
 
 
+@pytest.mark.slow
 def test_the_reaction_of_a_stop_takes_the_oversampled_axis() -> None:
     problem = problem_of(simulate(seed=2, seconds=12))
     term = Term(find_law("bump_stop"), "secondary", (1e-3, 1e7), scales=(1e-3, 1e7))

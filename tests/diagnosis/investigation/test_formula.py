@@ -105,6 +105,7 @@ def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_
     assert formula_trial._force_to_express(state, [leader, unnamed]) is led[expected]
 
 
+@pytest.mark.slow
 def test_a_weak_quadratic_spring_is_one_unknown_force_and_no_stop() -> None:
     """Stops leave no more than noise may leave; a smooth force says a quarter more, with certainty."""
     report = diagnose(quarter_car(), simulate(lambda d, v: 8e5 * d * d, seconds=30.0, seed=3), Options())

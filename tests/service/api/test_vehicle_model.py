@@ -142,6 +142,7 @@ def misfits(client: TestClient) -> list[dict[str, Any]]:
     return [a for a in client.get("/vehicles/a/alarms?active=true").json()["alarms"] if a["kind"] == "misfit"]
 
 
+@pytest.mark.slow
 def test_what_a_diagnosis_found_is_used_and_taken_back(
     client: TestClient, core: Core, settings: Settings, ride: Path, reading_here: None
 ) -> None:
