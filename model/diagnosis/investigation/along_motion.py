@@ -66,6 +66,29 @@ def with_laws_along_motion(state: Investigation, progress: Progress) -> Investig
     return None if best is None else _accepted(state, best, believed)
 
 
+def law_along_motion(state: Investigation) -> Candidate | None:
+    """The law that alone makes the force of the most suspicious element along the measured motion, to be fitted from
+    there; None where it takes several laws, or their simulation diverges.
+
+    For a model that is far from the recording: a law that yields permanently then hardly shows along the model's own
+    motion, and no step from a small share of it leads to its values.
+    """
+    rules = state.options.rules.screening
+    here = [one for one in state.last.candidates if one.score > 0 and one.location in state.system.elements]
+    best = max(here, key=lambda one: one.strength(rules), default=None)
+    measured = None if best is None else MeasuredMotion.of(state.problem, state.fit)
+    if best is None or measured is None:
+        return None
+    along = MeasuredMotion(*refreshed(measured.problem, measured.fit))
+    force, place = along.force_of(best.location), best.location
+    found = search(_task(state, place, force, along.fit), _pieces(state.problem.system), lags=()).final
+    if len({piece.effect for piece in found.model.pieces}) != 1 or len(found.model.pieces) != 1:
+        return None
+    start = _start(state, place, found, force, along.fit)
+    fit = _simulated(state, replace(start, terms=tuple(_narrow(state.problem.system, term) for term in start.terms)))
+    return None if fit is None else Candidate(fit.point.terms[-1], best.score, ELEMENT, start=fit.point)
+
+
 def _accepted(state: Investigation, best: Fit, sets: list[Fit]) -> Investigation | None:
     """The investigation with a set of laws as findings; None if one may be chance, or the held-out part refutes it."""
     problem, fit = refreshed(state.problem, best)
@@ -212,13 +235,9 @@ def _narrowed(problem: Problem, fit: Fit, given: int) -> Fit:
     """The fit with laws in their narrower forms, where these are likelier: regressions hardly tell which it is."""
     for index in range(given, len(fit.point.terms)):
         term, rules = fit.point.terms[index], problem.rules.evidence
-        narrow = next(
-            (law for law in problem.system.catalogue if law.wider is not None and law.wider == term.law), None
-        )
-        if narrow is None:
+        plain = _narrow(problem.system, term)
+        if plain is term:
             continue
-        count = len(narrow.parameters)
-        plain = Term(narrow, term.location, term.parameters[:count], scales=term.scales[:count])
         start = replace(fit.point, terms=(*fit.point.terms[:index], plain, *fit.point.terms[index + 1 :]))
         other = try_optimise(problem, start, _STEPS, fit.whitener)
         if other is None:
@@ -227,6 +246,15 @@ def _narrowed(problem: Problem, fit: Fit, given: int) -> Fit:
         if gain < cost(fit, rules, index) - cost(other, rules, index):
             fit = other
     return fit
+
+
+def _narrow(system: System, term: Term) -> Term:
+    """A law's narrower form with the same values; the term itself where there is none."""
+    narrow = next((law for law in system.catalogue if law.wider is not None and law.wider == term.law), None)
+    if narrow is None:
+        return term
+    count = len(narrow.parameters)
+    return Term(narrow, term.location, term.parameters[:count], scales=term.scales[:count])
 
 
 def _doubted(state: Investigation, fit: Fit) -> set[str]:

@@ -10,6 +10,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import finished, refreshed
 from sprung.model.diagnosis.fit.misfit import is_gross
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.along_motion import law_along_motion
 from sprung.model.diagnosis.investigation.calibration import (
     calibrated,
     may_be_calibration,
@@ -133,6 +134,9 @@ def _candidates(state: Investigation) -> list[Candidate]:
     # what is not sought sets no scale for the others
     screening = replace(screening, candidates=tuple(sought(state, screening.candidates)))
     chosen = shortlist(screening, rules.acceptance.alpha, options.multiplicity, rules, gross=gross, whole=_whole(state))
+    alone = law_along_motion(state) if gross and chosen and not state.found else None
+    if alone is not None:  # instead of the same law from where screening sees it
+        chosen = [alone, *(candidate for candidate in chosen if candidate.term.key != alone.term.key)]
     return untried(state, chosen)
 
 
