@@ -12,13 +12,17 @@ from sprung.model.diagnosis.investigation.state import InputFault
 from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
 from sprung.model.diagnosis.response.forward import mechanics_of
 from sprung.model.diagnosis.response.harmonic_balance import LawForces
-from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.response.newton import central_slopes
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.rules import RULES, PlausibleRules
 from sprung.model.laws import ElementLaw, StructureLaw, reversal_step
+from sprung.model.laws.along import force_along
 from sprung.model.laws.base import ParameterSpec
 from sprung.model.laws.sensor_faults import OF_CHANNEL
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
+
+_OWN = ("stiffness", "damping")  # of an element, its force's slopes over deflection and rate
 
 
 def figures(names: Sequence[str], per_sensor: FloatArray) -> FitFigures:
@@ -28,17 +32,22 @@ def figures(names: Sequence[str], per_sensor: FloatArray) -> FitFigures:
     )
 
 
-def deviations(system: System, fit: Fit) -> FloatArray:
+def deviations(system: System, fit: Fit, told: int | None = None) -> FloatArray:
     """Standard deviations of the log-ratios, (P,).
 
     The division between a force that no law of the catalogue explains and the spring and damper beside it is a
-    convention: their values are uncertain by what the force would change them.
+    convention: their values are uncertain by what the force would change them.  A spring that is stiffer beyond a gap
+    has another stiffness within it.
+
+    told: how many of the first laws are reported, by default all.  One that is not is a force without a name, too.
     """
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0))[: len(system.parameters)]
+    in_time = [number for number, term in enumerate(fit.point.terms) if evaluated_in_time(term)]
     for i, term in enumerate(fit.forces.terms if fit.forces is not None else ()):
-        if term.law.listed or fit.forces is None:
+        untold = told is not None and in_time[i] >= told
+        if (term.law.listed and not untold) or fit.forces is None:
             continue
-        for quantity, share in _linear_shares(fit.forces, i).items():
+        for quantity, share in _linear_shares(fit, fit.forces, i, whole=untold or not term.law.named).items():
             for j, parameter in enumerate(system.parameters):
                 if parameter.element == term.location and parameter.quantity == quantity:
                     value = parameter.nominal * np.exp(fit.point.theta[j])
@@ -46,23 +55,33 @@ def deviations(system: System, fit: Fit) -> FloatArray:
     return sigma
 
 
-def _linear_shares(forces: LawForces, index: int) -> dict[str, float]:
-    """Stiffness and damping that may belong to a force: of a formula its own, of an unnamed force all of it.
+def _linear_shares(fit: Fit, forces: LawForces, index: int, *, whole: bool) -> dict[str, float]:
+    """Stiffness and damping that may belong to a force: of a formula its own, of a force without a name all of it.
 
-    A surface is estimated beside spring and damper and has none of its own.
+    An estimated surface has none of its own on average; over the motion it has slopes as any force, and any of them may
+    be that of the spring or damper alone.  Forces with memory have no slopes.
     """
     term, d, v = forces.terms[index], forces.deflection[:, index], forces.rate[:, index]
     force = forces.force[:, index] + term.equivalent[0] * d + term.equivalent[1] * v
-    if term.law.named:
+    if not whole:
         columns = np.column_stack([d - np.mean(d), v - np.mean(v)])
         stiffness, damping = np.abs(np.linalg.lstsq(columns, force, rcond=None)[0])
         return {"stiffness": float(stiffness), "damping": float(damping)}
-    size = float(np.std(force))
-    return {name: size / max(float(np.std(along)), 1e-300) for name, along in (("stiffness", d), ("damping", v))}
+    shares = {name: float(np.std(force)) / max(float(np.std(x)), 1e-300) for name, x in zip(_OWN, (d, v), strict=True)}
+    law, element, grid = term.element_law, fit.forward.element_of(term), fit.forward.part.grid
+    if law.memory:
+        return shares
+
+    def moved(by_d: float, by_v: float) -> FloatArray:
+        return force_along(law, term.parameters, d + by_d, v + by_v, grid.start + grid.fine_time, element)
+
+    slopes = zip(_OWN, central_slopes(moved, d, v), strict=True)
+    return {name: max(shares[name], float(np.sqrt(np.mean(slope**2)))) for name, slope in slopes}
 
 
-def reported_parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ...]:
-    sigma = deviations(system, fit)
+def reported_parameters(system: System, fit: Fit, told: int | None = None) -> tuple[ReportedParameter, ...]:
+    """Values of a fit with their deviations; told: how many of the first laws are reported, by default all."""
+    sigma = deviations(system, fit, told)
     values = []
     for i, parameter in enumerate(system.parameters):
         value = parameter.nominal * float(np.exp(fit.point.theta[i]))
