@@ -68,10 +68,13 @@ def with_laws_along_motion(state: Investigation, progress: Progress) -> Investig
 
 def law_along_motion(state: Investigation) -> Candidate | None:
     """The law that alone makes the force of the most suspicious element along the measured motion, to be fitted from
-    there; None where it takes several laws, or their simulation diverges.
+    there; None where it takes several laws, or its simulation diverges.
+
+    None for a law with a corner, too, which begins blunt (`selection.along_measured`).
 
     For a model that is far from the recording: a law that yields permanently then hardly shows along the model's own
-    motion, and no step from a small share of it leads to its values.
+    motion, and no step from a small share of it leads to its values.  Nor do scores compare elements with bodies there:
+    a suspended mass imitates the resonance that a yielding storey has moved.
     """
     rules = state.options.rules.screening
     here = [one for one in state.last.candidates if one.score > 0 and one.location in state.system.elements]
@@ -82,7 +85,8 @@ def law_along_motion(state: Investigation) -> Candidate | None:
     along = MeasuredMotion(*refreshed(measured.problem, measured.fit))
     force, place = along.force_of(best.location), best.location
     found = search(_task(state, place, force, along.fit), _pieces(state.problem.system), lags=()).final
-    if len({piece.effect for piece in found.model.pieces}) != 1 or len(found.model.pieces) != 1:
+    terms = list(_terms(found, place, force))
+    if len(found.model.pieces) != 1 or len(terms) != 1 or terms[0].law.corner is not None:
         return None
     start = _start(state, place, found, force, along.fit)
     fit = _simulated(state, replace(start, terms=tuple(_narrow(state.problem.system, term) for term in start.terms)))

@@ -18,7 +18,6 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.rules import RULES, EvidenceRules, Rules, SelectionRules
-from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.selection.along_measured import SHARPENED, MeasuredMotion
 from sprung.model.diagnosis.selection.evidence import (
@@ -81,23 +80,18 @@ def shortlist(
 
     gross: whether the model's motion is far from the measured one.  Scores then indicate the place, but not which of
     an element's laws acts there: a law that yields permanently has little effect along a motion without yielding.
-    Nor do they compare laws of elements with others: a linear structure more, such as a suspended mass, imitates a
-    resonance that such a law has moved.
     """
     tests = {family: screening.tried(family) if multiplicity else 1 for family in screening.tests}
     good = [h for h in screening.candidates if chance(whole * h.score, h.freedom, tests[h.family]) <= alpha]
     if not good:
         return []
     good.sort(key=lambda h: h.strength(rules.screening), reverse=True)
-    screened, chosen_by = rules.screening, rules.selection
-    best: dict[bool, Candidate] = {}  # where little is explained: of laws at elements, and of others
-    for candidate in good:
-        best.setdefault(gross and candidate.family is ELEMENT, candidate)
+    top, screened, chosen_by = good[0].strength(rules.screening), rules.screening, rules.selection
+    place = good[0].location
     chosen: list[Candidate] = []
     unnamed: dict[str, int] = {}
     for candidate in good:
-        leader = best[gross and candidate.family is ELEMENT]
-        s, top, place = candidate.strength(screened), leader.strength(screened), leader.location
+        s = candidate.strength(screened)
         share = chosen_by.close if candidate.location == place else chosen_by.close_elsewhere
         known = gross and candidate.location == place and candidate.term.law.named and evaluated_in_time(candidate.term)
         if s < share * top and s < top - chosen_by.near and not known:

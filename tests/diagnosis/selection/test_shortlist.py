@@ -3,7 +3,7 @@
 import pytest
 
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.screening.families import ELEMENT, STRUCTURE
+from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.selection.compete import shortlist
 from sprung.model.laws import find_law
@@ -24,20 +24,6 @@ def test_all_laws_of_the_leading_element_are_fitted_where_little_is_explained(gr
     chosen = shortlist(Screening(tuple(candidates), {ELEMENT: 100}), alpha=1e-3, gross=gross)
     plain = [("storey", "cubic_stiffness"), ("storey", "air_spring")]
     assert [(one.location, one.effect) for one in chosen] == plain + [("storey", "bouc_wen")] * gross
-
-
-def test_laws_of_elements_are_fitted_beside_bodies_that_promise_more_where_little_is_explained() -> None:
-    candidates = [
-        Candidate(Term(law := find_law(name), at, law.absent), s, ELEMENT) for (at, name), s in SCORES.items()
-    ]
-    mass = find_law("suspended_mass")
-    screening = Screening(
-        (Candidate(Term(mass, "roof", mass.absent), 1e6, STRUCTURE), *candidates), {ELEMENT: 100, STRUCTURE: 10}
-    )
-    near = shortlist(screening, alpha=1e-3)
-    assert [one.effect for one in near] == ["suspended_mass"]
-    far = shortlist(screening, alpha=1e-3, gross=True)
-    assert [one.effect for one in far] == ["suspended_mass", "cubic_stiffness", "air_spring", "bouc_wen"]
 
 
 def test_what_would_be_significant_on_the_whole_recording_is_fitted() -> None:
