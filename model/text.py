@@ -4,6 +4,7 @@ logs and on pages."""
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 # zero-width ones, marks and changes of direction, separators of lines and paragraphs, the soft hyphen
 UNSEEN = r"\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
@@ -54,6 +55,15 @@ def first_line(error: Exception) -> str:
     """
     said = str(getattr(error, "orig", None) or error)
     return said.splitlines()[0] if said else type(error).__name__
+
+
+def some(names: Sequence[str], most: int, between: str = ", ") -> str:
+    """The first of several names, `most` of them, and how many more there are.
+
+    >>> some(["car", "bogie1", "bogie2"], 1), some(["car", "bogie1"], 2)
+    ('car and 2 more', 'car, bogie1')
+    """
+    return between.join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def counted(number: int, one: str, several: str = "") -> str:

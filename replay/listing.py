@@ -12,6 +12,7 @@ import numpy as np
 from cantools.database import Database
 
 from sprung.model.signals import ANY_TIME, Channel, TimeColumn
+from sprung.model.text import some
 from sprung.replay import csvtable, parquet, series
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.candatabase import load_database
@@ -19,7 +20,7 @@ from sprung.replay.frames import EXTENDED
 from sprung.replay.mcapfields import Field, Topic
 from sprung.replay.mcapfile import McapFile
 from sprung.replay.recording import CAN_READERS, TEXT_TABLES, kind_of
-from sprung.replay.tables import Column, some, time_name, time_of
+from sprung.replay.tables import NAMES, Column, time_name, time_of
 
 PROBED_BATCHES = 50  # of an MCAP file, in which its topics are looked for
 MOST_CHANNELS = 2_000
@@ -77,7 +78,7 @@ def _columns(path: Path, extension: str, time: TimeColumn, notes: list[str]) -> 
         listed = [(name, unit) for name, unit, numeric in every if numeric]
         others = [name for name, _, numeric in every if not numeric]
         if others:
-            notes.append(f"left out, since they hold no plain numbers: {some(others)}")
+            notes.append(f"left out, since they hold no plain numbers: {some(others, NAMES)}")
     else:
         listed, time = parquet.listing(path, time)
         times = time_name([name for name, _ in listed], time)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock
+from sprung.model.text import some
 from sprung.replay.account import Account
 
 EARLIEST = -86_400 * 1_000_000_000  # ns; times that count from a recording's start may begin a little before 0
@@ -164,10 +165,9 @@ class PlausibilityCheck:
         """One line on all channels that have at least so many."""
         found = np.flatnonzero(counts >= least)
         if len(found):
-            names = ", ".join(self._channels[index].name for index in found[:3].tolist())
-            more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+            names = some([self._channels[index].name for index in found.tolist()], 3)
             after = (self._first[kind] - (self._begun or 0)) / 1e9
-            self._account.note(f"{what}: {counts[found].sum()}, the first after {after:.2f} s ({names}{more})")
+            self._account.note(f"{what}: {counts[found].sum()}, the first after {after:.2f} s ({names})")
 
     def conclude(self) -> None:
         """At the end of the recording."""

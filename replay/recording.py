@@ -13,6 +13,7 @@ import numpy as np
 from cantools.database import Database
 
 from sprung.model.signals import ANY_TIME, Channel, SampleBlock, Tally, TimeColumn
+from sprung.model.text import some
 from sprung.replay import asc, blf, candump, csvtable, mcaptopics, mf4, parquet, series
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.auxiliary import AuxiliaryMeans
@@ -108,8 +109,7 @@ class Recording:
             raise UnreadableRecording(self._nothing())
         if not self.seen.all():
             names = [channel.name for channel, seen in zip(self.channels, self.seen, strict=True) if not seen]
-            more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-            self.account.problem(f"no values of {', '.join(names[:5])}{more}", incomplete=False)
+            self.account.problem(f"no values of {some(names, 5)}", incomplete=False)
 
     def _shift(self, first: int) -> int:
         """What is added to times that count from a start, ns."""

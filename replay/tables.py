@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, TimeColumn
+from sprung.model.text import some
 from sprung.model.units import FACTORS, known
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.bounds import check_samples
@@ -22,6 +23,7 @@ from sprung.replay.stamps import LATEST, SECOND, Stamps, is_written
 
 ROWS = 16_384  # that are handed out together
 MOST_COLUMNS = 10_000
+NAMES = 12  # that an error tells
 TIME_NAMES = (
     *("time", "t", "timestamp", "timestamps", "time stamp", "datetime", "date time", "date/time", "seconds", "secs"),
     *("sec", "elapsed time", "elapsed", "zeit", "zeitstempel", "temps", "tempo", "tiempo", "x_time", "rel time"),
@@ -119,7 +121,7 @@ def find_columns(
     similar = {name: difflib.get_close_matches(name, unused, n=3, cutoff=0.6) for _, name in lacking}
     if not found or any(similar.values()):
         hints = "; ".join(_hint(name, close) for name, close in similar.items())
-        raise UnreadableRecording(f"{path}: columns not found: {hints}; its columns: {some(names)}")
+        raise UnreadableRecording(f"{path}: columns not found: {hints}; its columns: {some(names, NAMES)}")
     for place, name in lacking:
         account.note(f"no column {name!r} for {channels[place].name}")
     return found
@@ -143,7 +145,7 @@ def _wanted_columns(
 
 def _hint(name: str, similar: list[str]) -> str:
     """A missing column with similar ones."""
-    return f"{name!r} (did you mean {some([repr(n) for n in similar], ' or ')}?)" if similar else repr(name)
+    return f"{name!r} (did you mean {some([repr(n) for n in similar], NAMES, ' or ')}?)" if similar else repr(name)
 
 
 def no_time(path: Path, names: Sequence[str], time: TimeColumn) -> UnreadableRecording:
@@ -151,16 +153,11 @@ def no_time(path: Path, names: Sequence[str], time: TimeColumn) -> UnreadableRec
     if time.name is not None:
         near = difflib.get_close_matches(time.name, list(names), n=1, cutoff=0.5)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
-        return UnreadableRecording(f"{path}: no time column {time.name!r}{hint}; its columns: {some(names)}")
+        return UnreadableRecording(f"{path}: no time column {time.name!r}{hint}; its columns: {some(names, NAMES)}")
     return UnreadableRecording(
         f"{path}: no column of times is recognised; set `time: {{column: NAME, unit: s}}` or "
-        f"`time: {{rate: HZ}}` in the system file; its columns: {some(names)}"
+        f"`time: {{rate: HZ}}` in the system file; its columns: {some(names, NAMES)}"
     )
-
-
-def some(names: Sequence[str], between: str = ", ") -> str:
-    """A few of them."""
-    return between.join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
 
 
 def seconds_of(unit: str | None) -> float | None:

@@ -489,8 +489,7 @@ class Explainer:
         far: clocks by very many, too.
         """
         C = self.channels
-        rows = [row for row in self.directions if row[C : 2 * C].any()]
-        found = self._late_by(window, rows, _LATE)
+        found = self._late_by(window, self.directions[self.directions[:, C : 2 * C].any(axis=1)], _LATE)
         return found if found is not None or not far else self._late_by(window, self._of_clocks, self._far)
 
     @property
@@ -500,9 +499,7 @@ class Explainer:
         later = np.arange(max(_LATE) + _APART, most, _APART)
         return (*-later[::-1], *later)
 
-    def _late_by(
-        self, window: FloatArray, rows: Sequence[FloatArray] | FloatArray, lates: Sequence[float]
-    ) -> FaultExplanation | None:
+    def _late_by(self, window: FloatArray, rows: FloatArray, lates: Sequence[float]) -> FaultExplanation | None:
         """One window (T, C) with channels, of `rows` over the deviations, that are late by one of `lates`, s, put
         right."""
         points = np.array([np.zeros(len(self.deviations)), *(row * late for row in rows for late in lates)])

@@ -27,6 +27,7 @@ from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray, IntArray, MeasurementFault
 from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
+from sprung.model.text import some
 from sprung.model.work import WorkBudget
 
 SOUGHT = ("frozen", "saturated", "noisy", "inverted", "swapped")  # known faults that windows are looked at for first
@@ -335,9 +336,8 @@ class Identifier:
         """Sets of columns, of each of which a window must contain one at least: what it lacks without, and which."""
         at = {channel.name: column for column, channel in enumerate(self.system.channels)}
         found = []
-        for what, names in (*(("input", some) for some in self.system.needed), ("sensor", set(self.system.sensors))):
-            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            found.append((f"missing {what} {min(names)}{more}", [at[name] for name in names]))
+        for what, names in (*(("input", one) for one in self.system.needed), ("sensor", set(self.system.sensors))):
+            found.append((f"missing {what} {some(sorted(names), 1)}", [at[name] for name in names]))
         return found
 
     def _lacks(self, windows: FloatArray) -> BoolArray:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from sprung.model.signals import Estimate, MeasurementFault, Window
+from sprung.model.text import some
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.engines import ServedModel
@@ -59,8 +60,7 @@ NO_EXCITATION = "no excitation: standstill, or too slow to tell anything"
 
 def lost_channels(names: Sequence[str]) -> str:
     """Why a window of a vehicle that runs tells nothing, though its channels `names` are all that is wrong."""
-    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-    return f"tells nothing without {names[0]}{more}, or at this speed"
+    return f"tells nothing without {some(names, 1)}, or at this speed"
 
 
 def outcome_of(window: Window, estimate: Estimate | None) -> tuple[str, str | None]:

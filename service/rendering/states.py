@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sprung.model.identification.estimates import WITHOUT_VALUES
+from sprung.model.text import some
 from sprung.service.monitoring.views import VehicleView, changed_part, suspected, unclear
 from sprung.service.monitoring.words import size_in_words
 from sprung.service.rendering.drawing import Mark
@@ -142,12 +143,12 @@ def _all_lost(view: VehicleView) -> bool:
 def _parameters(row: FleetRow, view: VehicleView, whole: int) -> list[Hint]:
     if _all_lost(view):
         missing = list(dict.fromkeys(c for p in view.parameters for c in str(p.lost_with).split("|")))
-        more = f" and {len(missing) - 1} more are" if len(missing) > 1 else " is"
+        are = "is" if len(missing) == 1 else "are"
         text = (
             "What is left of the measurements tells no spring or damper; values are those of before. Repair the node "
             "that sends these channels; no alarm of a spring or damper can come until then."
         )
-        return [Hint("alarm", f"Not monitored while {missing[0]}{more} lost", text)]
+        return [Hint("alarm", f"Not monitored while {some(missing, 1)} {are} lost", text)]
     found = []
     lost = [p for p in view.parameters if p.lost_with is not None]
     for channels in dict.fromkeys(p.lost_with for p in lost):

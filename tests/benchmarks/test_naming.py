@@ -17,7 +17,12 @@ def tried(name: str, motion: str) -> dict[str, object]:
 
 @pytest.mark.parametrize(
     ("name", "motion"),
-    [("nothing", "sine"), ("stribeck", "quake")],
+    [
+        ("nothing", "sine"),
+        ("stribeck", "quake"),
+        pytest.param("lugre", "sine", marks=pytest.mark.slow),
+        pytest.param("friction_backlash", "sweep", marks=pytest.mark.slow),
+    ],
 )
 def test_what_is_there_is_named(name: str, motion: str) -> None:
     line = tried(name, motion)

@@ -72,13 +72,16 @@ def test_a_file_cut_anywhere_is_read_up_to_the_cut(name: str, tmp_path: Path, db
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4])
-def test_flipped_bits_in_an_mcap_file_never_give_a_wrong_number(compression: CompressionType, tmp_path: Path) -> None:
+@pytest.mark.parametrize("flips", [60, pytest.param(150, marks=pytest.mark.slow)])
+def test_flipped_bits_in_an_mcap_file_never_give_a_wrong_number(
+    compression: CompressionType, flips: int, tmp_path: Path
+) -> None:
     path = tmp_path / "a.mcap"
     write_json(path, compression=compression, chunk=2048)
     whole = path.read_bytes()
     rng = np.random.default_rng(2)
     used, uncounted = [], 0
-    for _ in range(60):
+    for _ in range(flips):
         damaged = bytearray(whole)
         damaged[rng.integers(8, len(whole))] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)
@@ -94,7 +97,8 @@ def test_flipped_bits_in_an_mcap_file_never_give_a_wrong_number(compression: Com
         if counts["used"] < ROWS:
             assert recording.incomplete or counts["dropped"] or counts["foreign"] > 30
     assert np.mean(used) > 0.85 * ROWS  # a flip costs a chunk, not the recording
-    assert uncounted <= 3  # a flip in the statistics or in an index may take the expected number with it
+    # a flip in the statistics or in an index may take the expected number with it
+    assert uncounted <= max(3, flips // 30)
 
 
 def test_a_damaged_chunk_costs_its_messages_only_and_they_are_counted(tmp_path: Path) -> None:
@@ -124,12 +128,13 @@ def test_an_mcap_file_whose_writer_died_is_read_to_its_last_whole_chunk(tmp_path
     assert f"{sum(recording.tally.as_dict().values())} messages recovered" in recording.problems[0]
 
 
-def test_flipped_bits_in_a_blf_file_are_found_and_counted(tmp_path: Path, dbc: Path) -> None:
+@pytest.mark.parametrize("flips", [60, pytest.param(150, marks=pytest.mark.slow)])
+def test_flipped_bits_in_a_blf_file_are_found_and_counted(tmp_path: Path, dbc: Path, flips: int) -> None:
     path = tmp_path / "a.blf"
     write_can(path)
     whole = path.read_bytes()
     rng = np.random.default_rng(3)
-    for _ in range(60):
+    for _ in range(flips):
         damaged = bytearray(whole)
         damaged[rng.integers(144, len(whole))] ^= 1 << rng.integers(8)
         path.write_bytes(damaged)

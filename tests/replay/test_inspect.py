@@ -184,14 +184,15 @@ def test_motion_and_force_alone_make_a_component_test(tmp_path: Path, capfd: pyt
 
 
 @pytest.mark.parametrize(
+    "commands", [("inspect",), pytest.param(("replay", "diagnose"), marks=pytest.mark.slow)], ids=" ".join
+)
+@pytest.mark.parametrize(
     "name", ["a.csv", "a.mat", "a.json", "a.uff", "a.mcap", "a.parquet", "a.h5", "a.tdms", "a.xyz"]
 )
 def test_what_cannot_be_read_is_one_line_and_exit_status_2(
-    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, name: str, commands: tuple[str, ...], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    every = ("inspect", "replay", "diagnose")
-    texts = ((b"", every), (b"neither this\nor that\n" * 30, ("inspect",)), (bytes(range(256)) * 20, ("inspect",)))
-    for content, commands in texts:
+    for content in (b"", b"neither this\nor that\n" * 30, bytes(range(256)) * 20):
         (tmp_path / name).write_bytes(content)
         for command in commands:
             assert main([command, str(tmp_path / name)]) == 2

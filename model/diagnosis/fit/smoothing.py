@@ -8,13 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import irfft
 
 from sprung.model.diagnosis.fit.problem import Problem, SmoothedInputs
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
-from sprung.model.diagnosis.response.forward import Forward, propagate
+from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, fixed_point
 from sprung.model.diagnosis.response.point import Point
@@ -93,13 +92,13 @@ class _Smoother:
 
     @classmethod
     def of(cls, problem: Problem, forward: Forward) -> _Smoother:
-        whitener, band = Whitener.of(forward, problem.noise), problem.part.grid.band
-        free = whitener.factor @ problem.free_columns(forward)[band]
-        columns = problem.part.grid.pack(free)
+        whitener, part = Whitener.of(forward, problem.noise), problem.part
+        free = whitener.whitened(problem.free_columns(forward), part)
+        columns = part.grid.pack(free)
         scale = scale_of(columns.T @ columns, columns.shape[1])
         of_residual = scale[:, None] * np.linalg.pinv(columns * scale, rcond=1e-9)
-        rest = (problem.part.sensors - problem.shown(forward, None))[band]
-        return cls(problem, forward, whitener, free, of_residual, (whitener.factor @ rest[:, :, None])[:, :, 0])
+        base = whitener.whitened(part.sensors - problem.shown(forward, None), part)
+        return cls(problem, forward, whitener, free, of_residual, base)
 
     def explained(self, whitened: ComplexArray) -> tuple[FloatArray, ComplexArray]:
         """The initial state (2n,) that explains most of a whitened residual, and what it leaves, (F, S)."""
@@ -175,30 +174,14 @@ class _Answer:
         deflection = self.deflection.copy()
         deflection[grid.band] += (self.by_inputs @ shift[:, :, None])[:, :, 0]
         polynomial = self.polynomial + self.by_steady @ steady
-        driven = balance.under(_fine_motion(self, deflection, polynomial, state))
+        driven = balance.under(forward.fine_motion_of(deflection, polynomial, self.rows, state))
         balance.evaluations += len(balance.terms)
         return driven.law_forces(*driven.motion_of(spectrum, line))
 
 
-def _fine_motion(
-    answer: _Answer, deflection: ComplexArray, polynomial: FloatArray, state: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Deflection and rate along the ports, each (4N, m), of their parts and of an initial state."""
-    balance, grid = answer.balance, answer.balance.grid
-    count, size = len(balance.d0), OVERSAMPLING * np.sqrt(grid.samples)
-    swinging = irfft(np.stack([deflection.T, 1j * grid.omega * deflection.T]), count) * size
-    A = balance.plant.structure.state_matrix()
-    free = propagate(A, answer.rows, state, grid.step / OVERSAMPLING, count)
-    d, v = swinging.transpose(0, 2, 1)
-    m = len(balance.terms)
-    d = d + balance.powers @ polynomial + free[:, :m]
-    return d, v + balance.powers @ balance.plant.derivative(polynomial) + free[:, m:]
-
-
 def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
     """The part with inputs smoothed by a residual (F, S)."""
-    whitened = (whitener.factor @ spectrum[part.grid.band, :, None])[:, :, 0]
-    return _with_shift(part, _shift(whitener, whitened, part.support.shape[1]))
+    return _with_shift(part, _shift(whitener, whitener.whitened(spectrum, part), part.support.shape[1]))
 
 
 def _shift(whitener: Whitener, whitened: ComplexArray, supports: int) -> ComplexArray:

@@ -47,7 +47,9 @@ class Whitener:
 
     def __call__(self, spectrum: ComplexArray, part: Part) -> FloatArray:
         """(F, S) or (F, S, m) -> real unit-noise vectors (2 F S,) or (2 F S, m)."""
+        return part.grid.pack(self.whitened(spectrum, part))
+
+    def whitened(self, spectrum: ComplexArray, part: Part) -> ComplexArray:
+        """The compared bins of (F', S) or (F', S, m) in units of noise, (F, S) or (F, S, m)."""
         band = spectrum[part.grid.band]
-        if band.ndim == 2:
-            return part.grid.pack((self.factor @ band[:, :, None])[:, :, 0])
-        return part.grid.pack(self.factor @ band)
+        return (self.factor @ band[:, :, None])[:, :, 0] if band.ndim == 2 else self.factor @ band

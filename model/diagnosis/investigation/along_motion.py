@@ -8,7 +8,7 @@ it.  Its laws are found by regressions (`force.search`) and then simulated toget
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -76,19 +76,16 @@ def law_along_motion(state: Investigation) -> Candidate | None:
     motion, and no step from a small share of it leads to its values.  Nor do scores compare elements with bodies there:
     a suspended mass imitates the resonance that a yielding storey has moved.
     """
-    rules = state.options.rules.screening
-    here = [one for one in state.last.candidates if one.score > 0 and one.location in state.system.elements]
-    best = max(here, key=lambda one: one.strength(rules), default=None)
-    measured = None if best is None else MeasuredMotion.of(state.problem, state.fit)
+    best = _most_suspicious(state, [one for one in state.last.candidates if one.location in state.system.elements])
+    measured = None if best is None else _measured(state, best.location)
     if best is None or measured is None:
         return None
-    along = MeasuredMotion(*refreshed(measured.problem, measured.fit))
-    force, place = along.force_of(best.location), best.location
-    found = search(_task(state, place, force, along.fit), _pieces(state.problem.system), lags=()).final
-    terms = list(_terms(found, place, force))
+    along, force, task = measured
+    found = search(task, _pieces(state.problem.system), lags=()).final
+    terms = list(_terms(found, best.location, force))
     if len(found.model.pieces) != 1 or len(terms) != 1 or terms[0].law.corner is not None:
         return None
-    start = _start(state, place, found, force, along.fit)
+    start = _start(state, best.location, found, force, along)
     fit = _simulated(state, replace(start, terms=tuple(_narrow(state.problem.system, term) for term in start.terms)))
     return None if fit is None else Candidate(fit.point.terms[-1], best.score, ELEMENT, start=fit.point)
 
@@ -106,10 +103,23 @@ def _accepted(state: Investigation, best: Fit, sets: list[Fit]) -> Investigation
 
 def _place(state: Investigation) -> str | None:
     """The element with the most suspicious law in time; None where a part or a body is more suspicious."""
-    rules = state.options.rules.screening
-    here = [one for one in state.last.candidates if one.score > 0]
-    best = max(here, key=lambda one: one.strength(rules), default=None)
+    best = _most_suspicious(state, state.last.candidates)
     return best.location if best is not None and best.location in state.system.elements else None
+
+
+def _most_suspicious(state: Investigation, candidates: Iterable[Candidate]) -> Candidate | None:
+    rules = state.options.rules.screening
+    return max((one for one in candidates if one.score > 0), key=lambda one: one.strength(rules), default=None)
+
+
+def _measured(state: Investigation, place: str) -> tuple[Fit, ForceAlongMotion, ComponentTask] | None:
+    """The model along the measured motion, and the force of an element there, also as a task; None if it diverges."""
+    measured = MeasuredMotion.of(state.problem, state.fit)
+    if measured is None:
+        return None
+    along = MeasuredMotion(*refreshed(measured.problem, measured.fit))
+    force = along.force_of(place)
+    return along.fit, force, _task(state, place, force, along.fit)
 
 
 def _lacks_several(state: Investigation, place: str) -> bool:
@@ -129,23 +139,21 @@ def _sets_of_laws(state: Investigation, place: str) -> list[Fit]:
     simulations of both by far.  None where a single law makes the force: it competes with those of other places
     (`next_finding`).
     """
-    measured = MeasuredMotion.of(state.problem, state.fit)
+    measured = _measured(state, place)
     if measured is None:
         return []
-    along = MeasuredMotion(*refreshed(measured.problem, measured.fit))
-    force, pieces = along.force_of(place), _pieces(state.problem.system)
-    task = _task(state, place, force, along.fit)
+    (along, force, task), pieces = measured, _pieces(state.problem.system)
     first = search(task, pieces, lags=())
     names = dict.fromkeys(piece.effect for piece in first.final.model.pieces)
     if len(names) < 2:
         return []
-    fit = _simulated(state, _start(state, place, first.final, force, along.fit))
+    fit = _simulated(state, _start(state, place, first.final, force, along))
     if fit is not None and fit.chi_square < _FINE * state.fit.chi_square and not _doubted(state, fit):
         return [fit]
     most = state.options.rules.selection.alike * first.final.error
     others = (search(task, tuple(p for p in pieces if p.effect != name), lags=()) for name in names)
     starts = [
-        _start(state, place, other.final, force, along.fit)
+        _start(state, place, other.final, force, along)
         for other in others
         if len(other.steps) > 1 and other.final.error <= most
     ]

@@ -6,6 +6,7 @@ import numpy as np
 
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.values import deviations
+from sprung.model.text import some
 
 LOST_PHASE = "the free run loses its phase: the verdict is based not on its errors but on the unmeasured forces"
 
@@ -77,8 +78,7 @@ def undecided(state: Investigation) -> list[str]:
     loose = [p.name for i, p in enumerate(state.system.parameters) if sigma[i] > state.options.rules.report.loose]
     if not loose:
         return []
-    shown = ", ".join(loose[:6]) + (f" and {len(loose) - 6} more" if len(loose) > 6 else "")
     return [
-        f"undecided: {shown}: the motion is too small or the recording too short to distinguish them from nominal; "
-        "record longer, faster or on rougher track"
+        f"undecided: {some(loose, 6)}: the motion is too small or the recording too short to distinguish them from "
+        "nominal; record longer, faster or on rougher track"
     ]

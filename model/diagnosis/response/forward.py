@@ -10,6 +10,7 @@ from functools import cached_property
 from math import comb
 
 import numpy as np
+from scipy.fft import irfft
 from scipy.linalg import expm
 
 from sprung.model.diagnosis.record.signals import Part
@@ -293,16 +294,23 @@ class Forward:
 
     def fine_motion(self, ports: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflection and rate along ports (m, E) without laws' forces on the oversampled axis, each (4N, m)."""
-        plant, grid = self.plant, self.part.grid
-        ports = plant.structure.padded(ports)
-        spectrum = self.linear_deflection @ ports.T
-        d, v = np.split(grid.fine(np.hstack([spectrum, 1j * grid.omega[:, None] * spectrum])), 2, axis=1)
-        polynomial = self.polynomial[1] @ ports.T
-        d += grid.fine_monomials @ polynomial
-        v += grid.fine_monomials @ plant.derivative(polynomial)
-        A, rows = plant.structure.state_matrix(), plant.structure.motion_rows(ports)
-        free = propagate(A, rows, state, grid.step / OVERSAMPLING, len(d))
-        return d + free[:, : len(ports)], v + free[:, len(ports) :]
+        ports = self.plant.structure.padded(ports)
+        rows = self.plant.structure.motion_rows(ports)
+        return self.fine_motion_of(self.linear_deflection @ ports.T, self.polynomial[1] @ ports.T, rows, state)
+
+    def fine_motion_of(
+        self, deflection: ComplexArray, polynomial: FloatArray, rows: FloatArray, state: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same of a periodic deflection (F', m), a polynomial one (DEGREE + 1, m) and the free motion of a state.
+
+        rows: deflections, then rates, per state, (2m, 2n).
+        """
+        plant, grid, m = self.plant, self.part.grid, len(rows) // 2
+        series = np.stack([deflection.T, 1j * grid.omega * deflection.T])  # time last: contiguous transforms
+        d, v = (irfft(series, len(grid.fine_time)) * (OVERSAMPLING * np.sqrt(grid.samples))).transpose(0, 2, 1)
+        free = propagate(plant.structure.state_matrix(), rows, state, grid.step / OVERSAMPLING, len(d))
+        d = d + grid.fine_monomials @ polynomial + free[:, :m]
+        return d, v + grid.fine_monomials @ plant.derivative(polynomial) + free[:, m:]
 
     def law_forces(self, state: FloatArray, tolerance: float = TOLERANCE) -> LawForces | None:
         """Forces of the laws along their own trajectory, to a relative tolerance; None if there are no such laws."""

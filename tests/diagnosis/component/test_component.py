@@ -94,7 +94,7 @@ def test_a_spring_and_damper_with_preload_is_consistent_and_the_preload_no_fault
     assert found.unexplained.share == 0.0
 
 
-@pytest.mark.parametrize("factor", [0.1, 10.0])
+@pytest.mark.parametrize("factor", [0.1, pytest.param(1.0, marks=pytest.mark.slow), 10.0])
 def test_the_verdict_does_not_hang_on_the_declared_noise(factor: float) -> None:
     _, d, v = sweep(8.0)
     assert report(K * d + C * v, d, declared=factor).verdict == "consistent"

@@ -57,12 +57,12 @@ def test_where_a_search_ends_does_not_depend_on_which_thread_is_first(monkeypatc
     whole = WorkBudget(1e9)
     diagnose(system, record, Options(work=whole))
     ends = []
-    for workers in (1, 2):
+    for workers in (1, 2, 2):
         monkeypatch.setattr(compete, "WORKERS", workers)
         work = WorkBudget(0.5 * whole.done)
         report = diagnose(system, record, Options(work=work))
         ends.append((report.to_dict(), work.done))
-    assert ends[0] == ends[1] and work.ended
+    assert ends[0] == ends[1] == ends[2] and work.ended
 
 
 def test_the_share_done_grows_with_every_finding_and_ends_before_the_conclusion() -> None:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
+from sprung.benchmarks.shaken import ShakenRig, earthquake, integrated
 from sprung.model.diagnosis.api import Options
 from sprung.model.diagnosis.investigation.along_motion import law_along_motion
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.signals import FloatArray
 from sprung.model.system import parse_system
 
-RATE, FINE, SECONDS = 50.0, 16, 16.0
-MASSES, STIFFNESS, DAMPING = (3e5, 2.5e5), (2.0e8, 1.6e8), (7e5, 5e5)
+RATE, SECONDS = 50.0, 16.0
+MASSES, STIFFNESS, DAMPING = np.array([3e5, 2.5e5]), np.array([2.0e8, 1.6e8]), np.array([7e5, 5e5])
 POST_YIELD, YIELD = 0.2, 0.008  # share of the stiffness, m
 BUILDING = f"""
 name: building
@@ -31,39 +30,26 @@ sensors:
 """
 
 
-@dataclass
-class ShakenBuilding:
-    values: FloatArray
-    sample_rate: float = RATE
-    lost: int = 0
+def storeys() -> ShakenRig:
+    """Accelerations of ground and floors; the lower storey's hysteresis is Bouc's with exponent 2."""
+    random = np.random.default_rng(7)
+    ground = 1.3 * earthquake(int(SECONDS * RATE), RATE, random)
 
+    def rates(x: FloatArray, pushed: FloatArray) -> FloatArray:
+        drift, speed, z = np.diff(x[:2], prepend=0.0), np.diff(x[2:4], prepend=0.0), x[4]
+        first, second = STIFFNESS * drift + DAMPING * speed
+        first -= (1 - POST_YIELD) * STIFFNESS[0] * (drift[0] - z)
+        slip = 0.5 * (abs(speed[0]) * z * abs(z) + speed[0] * z * z) / YIELD**2
+        return np.array([*x[2:4], *np.array([second - first, -second]) / MASSES - pushed, speed[0] - slip])
 
-def earthquake() -> ShakenBuilding:
-    """Accelerations of ground and floors, by steps of 1.25 ms; the storey's hysteresis is Bouc's with exponent 2."""
-    random, samples = np.random.default_rng(7), int(SECONDS * RATE)
-    time, frequency = np.arange(samples) / RATE, np.fft.rfftfreq(samples, 1 / RATE)
-    spectrum = np.fft.rfft(random.standard_normal(samples)) * ((frequency > 0.3) & (frequency < 8))
-    quake = np.fft.irfft(spectrum, samples) * np.minimum(time / 2, 1) * np.exp(-np.maximum(time - 11, 0) / 3)
-    quake *= 4.0 / np.max(np.abs(quake))
-    ground = FINE * np.fft.irfft(np.fft.rfft(quake), samples * FINE)
-    x, v, z, step = np.zeros(2), np.zeros(2), 0.0, 1 / (RATE * FINE)
-    shown = np.empty((samples, 2))
-    for i, pushed in enumerate(ground):
-        d1, d2, v1, v2 = x[0], x[1] - x[0], v[0], v[1] - v[0]
-        first = STIFFNESS[0] * (POST_YIELD * d1 + (1 - POST_YIELD) * z) + DAMPING[0] * v1
-        second = STIFFNESS[1] * d2 + DAMPING[1] * v2
-        a = np.array([(second - first) / MASSES[0], -second / MASSES[1]])  # of the floors, not relative to the ground
-        if i % FINE == 0:
-            shown[i // FINE] = a
-        z += step * (v1 - 0.5 * (abs(v1) * z * abs(z) + v1 * z * z) / YIELD**2)
-        v = v + step * (a - pushed)
-        x = x + step * v
-    values = np.column_stack([quake, shown])
-    return ShakenBuilding(values + 0.005 * random.standard_normal(values.shape))
+    floors = integrated(rates, lambda x, pushed: rates(x, pushed)[2:4] + pushed, np.zeros(5), ground[:, None], RATE)
+    values = np.column_stack([ground, floors])
+    return ShakenRig(parse_system(BUILDING), values + 0.005 * random.standard_normal(values.shape), RATE)
 
 
 def test_its_hysteresis_is_read_from_its_force_along_the_measured_motion() -> None:
-    state = begun(parse_system(BUILDING), earthquake(), Options(), lambda share, text: None)
+    rig = storeys()
+    state = begun(rig.system, rig, Options(), lambda share, text: None)
     candidate = law_along_motion(state)
     assert candidate is not None and candidate.start is not None
     assert (candidate.location, candidate.effect) == ("first", "bouc_wen")

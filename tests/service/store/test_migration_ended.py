@@ -15,7 +15,6 @@ from sprung.benchmarks.trust_steps import STEPS
 from sprung.benchmarks.trust_zygote import DONE, Zygote
 from sprung.service.store import open_store
 
-ENDED = 4  # moments
 SERVE = """
 import os, signal, time
 from sqlalchemy import Engine, event
@@ -67,13 +66,14 @@ def version(path: Path) -> str:
         return str(store.execute("SELECT version_num FROM alembic_version").fetchone()[0])
 
 
+@pytest.mark.parametrize("moments", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_sigterm_within_a_migration_leaves_the_store_whole_and_the_next_start_completes_it(
-    tmp_path: Path, migration: KilledStep, zygote: Zygote
+    tmp_path: Path, migration: KilledStep, zygote: Zygote, moments: int
 ) -> None:
     count = statements(fresh(tmp_path / "alone", migration.prepare) / "sprung.db")
     newest = version(tmp_path / "alone" / "sprung.db")
-    assert count > ENDED
-    for statement in [1 + n * (count - 1) // (ENDED - 1) for n in range(ENDED)]:
+    assert count > moments
+    for statement in [1 + n * (count - 1) // (moments - 1) for n in range(moments)]:
         place = fresh(tmp_path / f"ended-{statement}", migration.prepare)
         code = SERVE.format(statement=statement, patience=5)
         process = started(KilledStep(code, migration.prepare, migration.judge), place, zygote)
