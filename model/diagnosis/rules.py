@@ -465,6 +465,9 @@ class ComponentRules:
     surface: int = rule(16, "values that an unnamed force counts as; chosen: its splines have 80, smoothed", 8, 40)
     one_cycle: float = rule(0.1, "of a cycle's travel and duration, within which all are one; chosen", 0.05, 0.2)
     stretches: int = rule(20, "of the fitted part, with errors of their own; derived: a covariance needs some", 10, 40)
+    another_curve: float = rule(
+        0.5, "of what a sum of curves leaves, left beside one more; chosen: most of it", 0.3, 0.7
+    )
     formula_reach: float = rule(20.0, "times the usual size of a length or rate, either way; chosen", 10.0, 40.0)
     formula_partners: int = rule(3, "shapes of a formula that others are tried beside; chosen", 2, 5)
     formula_significant: float = rule(5.0, "deviations of an amplitude; derived: one in a million", 3.0, 8.0)

@@ -78,6 +78,11 @@ def test_what_a_single_loop_shows_is_not_put_down_to_several_laws() -> None:
     assert line["verdict"] == "unknown_physics", line
 
 
+def test_a_curve_with_a_damper_that_the_deflection_makes_stronger_is_no_cubic_spring_by_one_loop() -> None:
+    line = tried("smooth spring", "sine")
+    assert line["verdict"] == "unknown_physics", line
+
+
 @pytest.mark.parametrize("name", ["lugre", "bouc_wen"])
 def test_a_memory_is_integrated_along_its_way(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     rig, d, signal = RIGS[name], moved("random", np.random.default_rng(4)), levels(np.random.default_rng(0))

@@ -12,11 +12,11 @@ from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.judgement import JudgedComponent, concluded
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
 from sprung.model.diagnosis.component.smooth import smooth_serves
-from sprung.model.diagnosis.force.fit import fitted, refined
-from sprung.model.diagnosis.force.piece import HYSTERESIS, SURFACE, Piece
+from sprung.model.diagnosis.force.fit import ComponentModel, fitted, refined
+from sprung.model.diagnosis.force.piece import HYSTERESIS, SURFACE, Lag, Part, Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.search import Progress as PieceProgress
-from sprung.model.diagnosis.force.search import Ranked, Step, search
+from sprung.model.diagnosis.force.search import Ranked, Step, determined, search
 from sprung.model.diagnosis.investigation.state import Options, Progress, Recorded
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.diagnosis.rules import ComponentRules, VerdictRules
@@ -25,7 +25,7 @@ from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.system import System
 
 _ONE_LOOP = (
-    "the test repeats one hysteresis loop, which several laws in combination can imitate whatever its origin; "
+    "the test repeats one loop, which several laws in combination can imitate whatever its origin; "
     "another amplitude or rate, or random motion, would tell them apart"
 )
 
@@ -80,11 +80,7 @@ def _judge(
         judged = replace(judged, record=replace(one, notes=(*one.notes, f"{one.element}: {_ONE_LOOP}")))
     else:
         judged = _established(judged, rules)
-    share = judged.errors.explained(rules)
-    left = bool(np.any(judged.errors.unexplained(rules) > 0))
-    least = _least(judged.found.steps, one.task.rules)
-    carried = bool(judged.found.steps) and share is not None and share >= least
-    if alone or (left and not carried) or smooth_serves(judged.final, len(one.given.pieces)):
+    if alone or _doubtful(judged, rules):
         progress("remaining force as a formula")
         candidate = _with_formula(judged, rules)
         if candidate is not None:
@@ -95,47 +91,84 @@ def _judge(
 
 
 def _only_one_loop(judged: JudgedComponent) -> bool:
-    """Whether hysteresis beside other laws was observed along a single loop, which such sums can always imitate.
+    """Whether laws that can imitate any loop were observed along a single one.
 
-    The held-out part repeats the same loop and cannot refute them.
+    The held-out part repeats the same loop and cannot refute them.  These are hysteresis beside other laws, and all
+    sums and laws of many values that leave more than noise even of the loop they were fitted to.
     """
-    task, found = judged.final.task, judged.found.steps
-    if len(found) < 2 or task.signals or not any(step.piece.kind is HYSTERESIS for step in found):
-        return False
-    return task.motion.repeats(task.rules)
+    task, pieces = judged.final.task, [step.piece for step in judged.found.steps]
+    imitates = len(pieces) > 1 and any(piece.kind is HYSTERESIS for piece in pieces)
+    imitates = imitates or (_imitating(pieces) and judged.final.leaves_more)
+    return imitates and not task.signals and task.motion.repeats(task.rules)
+
+
+def _doubtful(judged: JudgedComponent, rules: VerdictRules) -> bool:
+    """Whether the laws, if any, explain too little of what is no noise, or others would do as well."""
+    share, steps = judged.errors.explained(rules), judged.found.steps
+    carried = bool(steps) and share is not None and share >= _least(steps, judged.final.task.rules)
+    if np.any(judged.errors.unexplained(rules) > 0) and not carried:
+        return True
+    return bool(_undetermined(judged)) or smooth_serves(judged.final, len(judged.record.given.pieces))
+
+
+def _imitating(pieces: Sequence[Part]) -> bool:
+    """Whether laws are so flexible that they imitate others: several, or one of many values."""
+    return len(pieces) > 1 or any(isinstance(piece, Piece) and piece.imitates for piece in pieces)
+
+
+def _undetermined(judged: JudgedComponent) -> list[int]:
+    """Which of several laws that leave more than noise might be absent by the deviations that are told of them.
+
+    Their sum is then one of many that make nearly the same force.
+    """
+    final, first = judged.final, len(judged.record.given.pieces)
+    if len(judged.found.steps) < 2 or not final.leaves_more:
+        return []
+    laws = [n for n in range(len(judged.found.steps)) if not isinstance(final.model.pieces[first + n], Lag)]
+    return [n for n in laws if not determined(final, first + n, *judged.covariance)]
 
 
 def _least(steps: tuple[Step, ...], rules: ComponentRules) -> float:
     """Least share of the excess power that true laws explain; more for several laws, which are more flexible."""
-    one = len(steps) < 2 and not any(isinstance(p, Piece) and p.imitates for p in (s.piece for s in steps))
-    return rules.named if one else 1 - rules.together
+    return 1 - rules.together if _imitating([step.piece for step in steps]) else rules.named
 
 
 def _established(judged: JudgedComponent, rules: VerdictRules) -> JudgedComponent:
-    """With the first law only, if it suffices and several laws leave too much to be named.
+    """With the first law only, if it suffices and several laws leave too much to be named, or are undetermined.
 
     If the first does not suffice, all are kept as the closest approximation, and none is named.
     """
     task, steps = judged.final.task, judged.found.steps
     share = judged.errors.explained(rules)
-    if len(steps) < 2 or share is None or share >= _least(steps, task.rules):
+    if len(steps) < 2 or share is None:
         return judged
-    first = steps[0].chosen
-    final = refined(task, first.fit.model)
+    undetermined = _undetermined(judged)
+    if 0 in undetermined or (share >= _least(steps, task.rules) and not undetermined):
+        return judged
+    final = refined(task, _given_and(judged, steps[0]))
     one = replace(judged, found=replace(judged.found, steps=steps[:1]), final=final, floor=final.floor)
     alone = one.errors.explained(rules)
     return one if alone is not None and alone >= _least(steps[:1], task.rules) else judged
 
 
+def _given_and(judged: JudgedComponent, step: Step) -> ComponentModel:
+    """The given laws and that of a step alone, which others may have been found beside."""
+    model = step.chosen.fit.model
+    kept = [*range(len(judged.record.given.pieces)), step.index % len(model.pieces)]
+    return ComponentModel(tuple(model.pieces[i] for i in kept), tuple(model.shapes[i] for i in kept))
+
+
 def _with_formula(judged: JudgedComponent, rules: VerdictRules) -> JudgedComponent | None:
-    """With a formula for the unexplained force, if one explains as much as a law must."""
+    """With a formula for the unexplained force, if it explains as much as a law must, and hardly less than the laws."""
     with np.errstate(all="ignore"):  # trial formulas overflow
         found = formula_search(judged.record.task, judged.record.given)
     if found is None:
         return None
     candidate = replace(judged, found=found, final=found.final, floor=found.final.floor)
-    share = candidate.errors.explained(rules)
-    return candidate if share is not None and share >= judged.record.task.rules.named else None
+    share, final = candidate.errors.explained(rules), candidate.final
+    if share is None or share < judged.record.task.rules.named:
+        return None
+    return None if final.leaves_more and not final.leaves_hardly_more(judged.final) else candidate
 
 
 def _closest(judged: JudgedComponent) -> JudgedComponent:

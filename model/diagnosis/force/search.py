@@ -28,6 +28,7 @@ from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.pieces_following import pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
+from sprung.model.signals import FloatArray
 
 Progress = Callable[[str], None]
 
@@ -255,14 +256,9 @@ def plausible(fit: ComponentFit, index: int = -1) -> bool:
     )
 
 
-def _determined(fit: ComponentFit, *, by_all: bool = False) -> bool:
-    """Whether the last law's first parameter and first quoted value are significant.
-
-    by_all: with systematic errors.
-    """
-    index = len(fit.model.pieces) - 1
-    full, names = covariance(fit)
-    sigma = spread(fit, index, full + left_open(fit) if by_all else full, names)
+def determined(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> bool:
+    """Whether a law's first parameter and first quoted value are significant under a covariance and its names."""
+    sigma = spread(fit, index, full, names)
     values = [fit.values(index), fit.quoted(index)]
     significant = [
         abs(next(iter(of.values()))[0]) > fit.task.rules.significant * float(s[0])
@@ -270,6 +266,12 @@ def _determined(fit: ComponentFit, *, by_all: bool = False) -> bool:
         if of
     ]
     return all(significant)
+
+
+def _determined(fit: ComponentFit, *, by_all: bool = False) -> bool:
+    """Whether the last law is determined.  by_all: with systematic errors."""
+    full, names = covariance(fit)
+    return determined(fit, len(fit.model.pieces) - 1, full + left_open(fit) if by_all else full, names)
 
 
 def _accepted(

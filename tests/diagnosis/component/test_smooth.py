@@ -41,3 +41,17 @@ def test_stops_are_distinguished_from_a_smooth_spring(
 def test_one_law_of_few_numbers_is_not_asked() -> None:
     fit = refined(task(600 * X**2 + 50 * np.tanh(V / 1e-3)), NO_LAWS.plus(piece("bump_stop", 2), (0.5 * TRAVEL,)))
     assert not smooth_serves(fit, 0)
+
+
+@pytest.mark.parametrize(
+    ("beside", "serves"),
+    [
+        (60 * np.abs(X), True),
+        (0.0 * X, False),
+        (40 * np.tanh(V / 1e-2), False),  # what they leave is no curve
+    ],
+)
+def test_a_sum_of_laws_that_leaves_another_curve_is_none_of_them(beside: FloatArray, *, serves: bool) -> None:
+    start = NO_LAWS.plus(piece("bump_stop", 4), (0.4 * TRAVEL, 0.6 * TRAVEL)).plus(piece("cubic_stiffness", 1), ())
+    fit = refined(task(stops(1.0) + 300 * X**3 + beside), start)
+    assert smooth_serves(fit, 0) is serves
