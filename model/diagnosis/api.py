@@ -15,7 +15,7 @@ from sprung.model.diagnosis.investigation.state import Options, Outcome, Progres
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError, prepare
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.report.report import Finding, Report
-from sprung.model.diagnosis.selection.along_measured import with_disturbances
+from sprung.model.diagnosis.selection.along_measured import disturbed, with_disturbances
 from sprung.model.laws import ElementLaw
 from sprung.model.laws.following import Covariate, following_law
 from sprung.model.signals import FloatArray
@@ -76,22 +76,40 @@ def diagnose(
             return diagnose_unforced(system, prepared, record, options, progress)
         record = RecordedPart(record.sample_rate, record.values[decay], record.lost)
     outcome = investigate(system, record, options, progress)
-    if not system.file.inputs and outcome.judgement.rejected:
-        outcome = _along_what_was_seen(system, record, options, progress) or outcome
+    if _may_be_followed(outcome):
+        outcome = _along_what_was_seen(system, record, options, progress, outcome)
     progress(0.95, "report")
     report = compose(outcome, record)
     progress(1.0, "done")
     return report
 
 
-def _along_what_was_seen(system: System, record: Recorded, options: Options, progress: Progress) -> Outcome | None:
-    """A free decay whose phase no simulation keeps, laws acting along the motion that the sensors saw; None: nor so.
+def _may_be_followed(outcome: Outcome) -> bool:
+    """Whether no simulation keeps to a motion that the sensors saw of bodies on which no force was measured.
 
-    A law that shifts the frequency makes a linear start diverge within a few periods.  With forces that nobody measured
-    on every body, as strong as they have to be, the fit is one of forces along the measured motion.
+    That is the motion of a free decay that rejects the model, or one beside a measured force that nothing explains.
     """
-    pushed = with_disturbances(system)
-    none = np.zeros((len(record.values), len(system.bodies)))
-    values = np.column_stack([none, record.values])
+    system = outcome.investigation.system
+    if not system.file.inputs:
+        return outcome.judgement.rejected
+    unknown = outcome.judgement.verdict == "unknown_physics" and not outcome.investigation.setup_faults
+    return unknown and outcome.investigation.problem.process_noise and bool(disturbed(with_disturbances(system)))
+
+
+def _along_what_was_seen(
+    system: System, record: Recorded, options: Options, progress: Progress, simulated: Outcome
+) -> Outcome:
+    """The outcome with laws acting along the motion that the sensors saw; the simulated one where that is no better.
+
+    A law that shifts the frequency makes a linear start diverge within a few periods, and hard stops between bodies
+    make a simulation under a measured force leave the recording.  With forces that nobody measured on every other body,
+    as strong as they have to be, the fit is one of forces along the measured motion.
+    """
+    pushed, inputs = with_disturbances(system), len(system.inputs)
+    nothing = np.zeros((len(record.values), len(pushed.inputs) - inputs))
+    values = np.column_stack([record.values[:, :inputs], nothing, record.values[:, inputs:]])
     outcome = investigate(pushed, RecordedPart(record.sample_rate, values, record.lost), options, progress)
-    return None if outcome.judgement.rejected else outcome
+    if not inputs:
+        return simulated if outcome.judgement.rejected else outcome
+    named = outcome.judgement.verdict == "missing_physics" and outcome.after.nrmse < simulated.after.nrmse
+    return outcome if named else simulated

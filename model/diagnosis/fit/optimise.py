@@ -68,8 +68,9 @@ class Fit:
 
     @property
     def converged(self) -> bool:
-        """Whether the last decrease of the objective is too small to matter."""
-        return self.left < self.unsettled * self.grain
+        """Whether the last decrease of the objective is too small to matter, and laws agree with a smoothed motion."""
+        agree = self.forces is None or self.forces.converged or not self.noise.process_noise
+        return agree and self.left < self.unsettled * self.grain
 
     @property
     def grain(self) -> float:

@@ -32,6 +32,7 @@ class SmoothedInputs:
 
     part: Part
     force: FloatArray | None = None  # of the laws along the smoothed motion, (4N, m)
+    settled: bool = True  # whether these and the motion agree
 
 
 @dataclass(frozen=True)
@@ -131,4 +132,4 @@ def law_forces(
     if inputs is None or inputs.force is None:
         return forward.law_forces(point.state, tolerance)
     balance = forward.harmonic_balance(point.state)
-    return None if balance is None else balance.solution(inputs.force)
+    return None if balance is None else balance.solution(inputs.force, inputs.settled)

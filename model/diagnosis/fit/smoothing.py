@@ -72,10 +72,10 @@ def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Workin
         if point.warm_start
         else answer(np.zeros((len(balance.d0), len(balance.terms))))
     )
-    force, _ = fixed_point(answer, start, _FOLLOWED)
+    force, settled = fixed_point(answer, start, _FOLLOWED)
     problem.count(_COSTLY * balance.evaluations)
     state, whitened = smoother.explained(answer.whitened(*problem.part.grid.split_law_forces(force)))
-    inputs = SmoothedInputs(_with_shift(problem.part, smoother.shift(whitened)), force)
+    inputs = SmoothedInputs(_with_shift(problem.part, smoother.shift(whitened)), force, settled)
     return replace(point, state=state, warm_start=tuple(force.T)), Working(smoother.whitener, inputs, forward.plant)
 
 

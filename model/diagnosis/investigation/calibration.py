@@ -24,12 +24,13 @@ from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.floor import leaves_more_than_noise
-from sprung.model.diagnosis.investigation.state import Investigation
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.diagnosis.selection.along_measured import disturbed
 from sprung.model.diagnosis.selection.plausible import hardly_there, out_of_range
 from sprung.model.laws import Law, SensorLaw
 from sprung.model.laws.base import DataSheet
@@ -188,7 +189,9 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     """
     file, terms = state.fit.point.terms[: state.given], calibration_terms(state)
     keys = {term.key for term in terms}
-    found = tuple(term for term in state.fit.point.terms[state.given :] if term.key not in keys)
+    beyond = state.fit.point.terms[state.given :]
+    laws = tuple(one for one, term in zip(state.found, beyond, strict=True) if term.key not in keys)
+    found = tuple(term for term in beyond if term.key not in keys)
     problem = state.problem
     for _ in range(_PASSES):
         fit = try_optimise(problem, replace(state.fit.point, terms=(*file, *terms, *found)), _STEPS)
@@ -216,10 +219,23 @@ def calibrated(state: Investigation, first: Term) -> Investigation:
     screening = screen(problem, base, state.problem.system.catalogue, state.options.project)
     begun = replace(state, problem=problem, base=base, fit=base, found=(), first=screening, last=screening, wider=None)
     begun = replace(begun, held=replace(state.held, noise=problem.noise), calibrations=len(held))
+    if found and disturbed(problem.system):
+        return _with_laws_kept(begun, with_them, laws)
     if float(np.max(misfit(base))) > state.options.rules.setup.misfit:
         return begun  # fixed until the missing law is found: before, they would diverge
     base = with_free_gains(begun, base)
     return replace(begun, base=base, fit=base)
+
+
+def _with_laws_kept(begun: Investigation, beside: Investigation, laws: tuple[AcceptedFinding, ...]) -> Investigation:
+    """A search begun anew with calibration errors, which goes on beside the laws that were found.
+
+    Along a motion that the sensors saw, unmeasured forces are whatever masses, gains and springs do not explain: beside
+    free gains and masses no law shows in them, but those that were found without these are right beside them.
+    """
+    problem, fit = beside.problem, with_free_gains(begun, beside.fit)
+    last = screen(problem, fit, problem.system.catalogue, begun.options.project)
+    return replace(begun, problem=problem, fit=fit, held=beside.held, found=laws, last=last)
 
 
 def _with_heavy_tails(fit: Fit, indices: range) -> tuple[Term, ...]:
@@ -322,11 +338,12 @@ def _of_all_bodies(state: Investigation) -> Iterator[Term]:
 def _of_bodies(state: Investigation, law: Law) -> Iterator[Term]:
     """Changes of the quantity of bodies that a law scales, where the system file does not estimate it.
 
-    Without a measured force, the heaviest body's is kept: masses are then known up to a common factor only.
+    Without a measured force, the heaviest body's is kept: masses are then known up to a common factor only.  Beside a
+    force that nobody measured no mass is known better than before: that force makes up for it.
     """
     system, rules = state.problem.system, state.options.rules.plausible
     known = {p.name.removesuffix(f".{law.scales}") for p in system.parameters}
-    known |= {term.location for term in state.fit.point.terms[: state.given] if term.law == law}
+    known |= {term.location for term in state.fit.point.terms[: state.given] if term.law == law} | disturbed(system)
     if not _measures_force(system):
         known.add(max(system.bodies, key=lambda name: getattr(system.file.bodies[name], law.scales).value))
     for name in system.bodies:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.fit.jacobian import linearise
-from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.problem import Problem, law_forces
 from sprung.model.diagnosis.fit.smoothing import along_measured_motion
 from sprung.model.diagnosis.fit.tangent import tangent
 from sprung.model.diagnosis.record.channels import prepare
@@ -75,6 +75,17 @@ def test_forces_of_laws_are_those_along_the_motion_under_the_smoothed_inputs(tex
     expected = balance.law_forces(*balance.motion(force))
     assert np.abs(force).max() > 0.1
     assert np.linalg.norm(force - expected) < 1e-3 * np.linalg.norm(force)
+    assert working.inputs.settled
+
+
+def test_forces_that_do_not_agree_with_the_motion_are_said_not_to() -> None:
+    """A stop a hundred times as stiff as the link is in contact here and there: the iteration ends without a motion."""
+    problem, start = problem_of(HELD)
+    hard = replace(start, terms=(start.terms[0].at(np.array([2e-4, 2e6])),))
+    point, working = along_measured_motion(problem, hard)
+    assert working.inputs is not None and not working.inputs.settled
+    forces = law_forces(problem.forward(point, working.inputs), point, working.inputs)
+    assert forces is not None and not forces.converged
 
 
 def test_smoothing_and_sensitivities_count_as_work() -> None:
