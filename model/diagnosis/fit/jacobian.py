@@ -64,6 +64,10 @@ class Linearised:
         """The residual, whitened, (R,)."""
         return self.working.whitener(self.spectrum, self.problem.part)
 
+    def whitened_after(self, step: FloatArray) -> ComplexArray:
+        """The whitened residual that a small step (P + p + 2n,) leaves, (F, S)."""
+        return self.problem.part.grid.unpack(self.residual - self.jacobian @ step, len(self.problem.sensors))
+
     @property
     def log_det(self) -> float:
         """Of the residual's covariance."""

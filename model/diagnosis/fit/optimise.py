@@ -18,7 +18,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.jacobian import Linearised, linearise
 from sprung.model.diagnosis.fit.linear_equivalent import with_equivalents
 from sprung.model.diagnosis.fit.memory import key_of
-from sprung.model.diagnosis.fit.problem import Problem, law_forces
+from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import Working, along_measured_motion, opened, scale_of, smoothed
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Noise
@@ -34,6 +34,8 @@ from sprung.model.signals import FloatArray
 _DAMPING = (1e-6, 1e3)  # first and most, of the scaled normal equations
 _MUCH = 0.03  # of chi-square, that a step promises: if it fails, initial state and reaction of the laws are refined
 _STARTS, _LOWER = 5, 0.01  # of these, at most, while each lowers the objective by this share
+_FAST, _PARALLEL = 0.3, 0.9  # ratio of steps that converge soon enough; cosine of steps whose ratio counts
+_RELAXED = (0.3, 2.0)  # least and most of a step that is taken
 _HOPEFUL = 0.5  # of the fall that is needed, that it has to promise; where it succeeded, it promised 0.96 and more
 
 
@@ -158,8 +160,8 @@ def optimise(
 ) -> Fit:
     """Gauss-Newton with Levenberg-Marquardt damping; stops when no parameter moves by `tolerance` std.
 
-    The fit is the best point evaluated: steps that raise the objective are rejected.  As every step smooths the
-    inputs and solves the harmonic balance anew, steps are compared with the present point under the same new inputs.
+    Steps that raise the objective are rejected.  As every step smooths the inputs anew, by the residual that it
+    promises, a small rise may be theirs: the present point is then linearised under the same new inputs.
     `whitener`: of the fit whose chi-square this one is compared with; by default of the model at the start.
     """
     if problem.memory is None:
@@ -177,29 +179,31 @@ def optimise(
 
 
 def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float, whitener: Whitener | None) -> Fit:
-    state, unforced = _state(problem, *_begun(problem, start, whitener)), not problem.system.file.inputs
-    if unforced:
+    state = _state(problem, *_begun(problem, start, whitener))
+    if not problem.system.file.inputs:
         state = _begun_anew(problem, state)
     rules, damping, left, count = problem.rules.fit, _DAMPING[0], np.inf, 0
+    relaxation, renewed = _Relaxation(), False  # whether the present point's inputs were smoothed anew
     for count in range(1, max(1, round(rules.patience * iterations)) + 1):
         step, sigma, promised = _step(problem, state.lin, state.point, damping)
+        if not problem.process_noise:  # whose sensitivities know what the smoother makes of the laws' forces
+            relaxation = relaxation.after(state.lin.jacobian @ step)
+        step = relaxation.factor * step
         size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
         grain = _grain(problem, state)
-        trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.spectrum)
-        proposed = _state(problem, trial, working, fine=state.lin.fine)
-        if unforced:
-            proposed = _begun_anew(problem, proposed)
+        proposed = _proposed(problem, state, step, promised)
         if proposed.value >= state.value and promised < rules.numerical * grain:
             left = promised
             break
-        if not (unforced or problem.process_noise) and promised > _MUCH * state.chi_square:
-            proposed = _lower_by_its_start(problem, proposed, state.value)
         rise = proposed.value - state.value
-        if 0 <= rise < rules.smoothing * state.chi_square and not problem.process_noise:
-            state = replace(state, working=working, value=_value_under(problem, state, working))
+        if 0 <= rise < rules.smoothing * state.chi_square and not (renewed or problem.process_noise):
+            state, renewed = _state(problem, state.point, proposed.working, fine=state.lin.fine), True
+            if proposed.value >= state.value:
+                left, relaxation = promised, _Relaxation()
+                continue
         if proposed.value < state.value:
             left = state.value - proposed.value
-            state = proposed
+            state, renewed = proposed, False
             damping = max(damping / 10, _DAMPING[0] / 1e3)
             if size < tolerance or left < rules.done * grain * max(1.0, size):
                 break
@@ -208,11 +212,46 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
         elif promised > _MUCH * state.chi_square and state.lin.may_be_finer:
             left, state = promised, replace(state, lin=replace(state.lin, fine=True))
         else:
-            left = promised
+            left, relaxation = promised, _Relaxation()
             damping = max(damping * 30, 100 * _DAMPING[0])
             if damping > _DAMPING[1]:
                 break
     return _finish(problem, state, left, count)
+
+
+def _proposed(problem: Problem, state: _State, step: FloatArray, promised: float) -> _State:
+    """The model a step further, under inputs smoothed by the residual that the step is to leave."""
+    trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.whitened_after(step))
+    proposed = _state(problem, trial, working, fine=state.lin.fine)
+    if not problem.system.file.inputs:
+        return _begun_anew(problem, proposed)
+    if not problem.process_noise and promised > _MUCH * state.chi_square:
+        return _lower_by_its_start(problem, proposed, state.value)
+    return proposed
+
+
+@dataclass(frozen=True)
+class _Relaxation:
+    """Share of a step that is taken, by Aitken's method for vector sequences (Irons and Tuck 1969).
+
+    The covariance R and the smoother know the plant with equivalents of its laws, not the laws: where a law adds to the
+    stiffness, steps of Gauss-Newton overshoot by a constant ratio and come back, or fall short by one.
+    """
+
+    factor: float = 1.0
+    last: FloatArray | None = None  # full step before, by what it was to change of the whitened residual, (R,)
+
+    def after(self, change: FloatArray) -> _Relaxation:
+        """That of the next full step: the ratio of steps that are parallel says how far they go beside the mark."""
+        if self.last is None:
+            return replace(self, last=change)
+        along, size = float(change @ self.last), float(self.last @ self.last)
+        ratio = along / max(size, 1e-300)
+        if abs(ratio) < _FAST:
+            return replace(self, last=change)
+        if abs(along) < _PARALLEL * np.sqrt(size * float(change @ change)) or ratio >= 1:
+            return _Relaxation(1.0, change)
+        return _Relaxation(float(np.clip(self.factor / (1 - ratio), *_RELAXED)), change)
 
 
 def _grain(problem: Problem, state: _State) -> float:
@@ -262,10 +301,9 @@ def _lower_by_its_start(problem: Problem, proposed: _State, below: float) -> _St
         forces = proposed.lin.forces
         if proposed.value < below or forces is None or not forces.converged:
             break
-        other = _begun_anew(problem, proposed, below)
-        if other.value > proposed.value - _LOWER * abs(proposed.value):
+        before, proposed = proposed, _begun_anew(problem, proposed, below)
+        if proposed.value > before.value - _LOWER * abs(before.value):
             break
-        proposed = other
     return proposed
 
 
@@ -281,18 +319,6 @@ def _prior_residual(problem: Problem, point: Point) -> tuple[FloatArray, FloatAr
         away.append(term.prior_deviations)
         sharp.append(1 / np.array(term.known) if term.known else np.zeros(len(term.parameters)))
     return np.concatenate(away), np.concatenate(sharp)
-
-
-def _value_under(problem: Problem, state: _State, working: Working) -> float:
-    """The objective at the present point under newly smoothed inputs."""
-    inputs, point = working.inputs, state.point
-    if inputs is None:
-        return state.value
-    forward = state.lin.forward.with_part(inputs.part, point.warm_start)
-    shown = problem.shown(forward, law_forces(forward, point, inputs))
-    free = problem.free_columns(forward) @ point.state
-    residual = working.whitener(problem.part.sensors - shown - free, problem.part)
-    return _value(problem, residual, state.lin.log_det, point)
 
 
 def information(problem: Problem, fit: Fit) -> FloatArray:

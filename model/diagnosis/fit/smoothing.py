@@ -41,15 +41,15 @@ def opened(problem: Problem, point: Point, whitener: Whitener | None = None) -> 
     return point, Working(whitener or Whitener.of(problem.forward(point), problem.noise))
 
 
-def smoothed(problem: Problem, point: Point, working: Working, spectrum: ComplexArray) -> tuple[Point, Working]:
-    """Smooth the inputs at a point near the last one, whose residual was `spectrum` (F, S).
+def smoothed(problem: Problem, point: Point, working: Working, whitened: ComplexArray) -> tuple[Point, Working]:
+    """Smooth the inputs at a point whose whitened residual is about `whitened` (F, S).
 
     Returns the point and its weights; in systems with measured forces the initial state is fitted anew.
     """
     if problem.process_noise:
         return along_measured_motion(problem, point)
-    # the noise of supports is small: the last residual is accurate enough
-    return point, replace(working, inputs=SmoothedInputs(_smoothed(problem.part, working.whitener, spectrum)))
+    shift = _shift(working.whitener, whitened, problem.part.support.shape[1])
+    return point, replace(working, inputs=SmoothedInputs(_with_shift(problem.part, shift)))
 
 
 def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Working]:
@@ -177,11 +177,6 @@ class _Answer:
         driven = balance.under(forward.fine_motion_of(deflection, polynomial, self.rows, state))
         balance.evaluations += len(balance.terms)
         return driven.law_forces(*driven.motion_of(spectrum, line))
-
-
-def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
-    """The part with inputs smoothed by a residual (F, S)."""
-    return _with_shift(part, _shift(whitener, whitener.whitened(spectrum, part), part.support.shape[1]))
 
 
 def _shift(whitener: Whitener, whitened: ComplexArray, supports: int) -> ComplexArray:

@@ -168,6 +168,13 @@ class Grid:
         flat = (-1, *spectrum.shape[2:])
         return np.concatenate([real.reshape(flat), imag.reshape(flat)])
 
+    def unpack(self, packed: FloatArray, sensors: int) -> ComplexArray:
+        """Compared bins (F, S) of one packed vector (2 F S,)."""
+        real, imag = packed.reshape(2, -1, sensors)
+        found: ComplexArray = np.empty(real.shape, dtype=complex)
+        found.real, found.imag = real / self.weight[:, None], imag / self.weight[:, None]
+        return found
+
 
 @dataclass(frozen=True)
 class ThinnedGrid(Grid):

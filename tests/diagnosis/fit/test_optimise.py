@@ -10,12 +10,13 @@ from sprung.model.diagnosis.fit import optimise as module
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.fit.optimise import Fit, optimise, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.smoothing import Working, smoothed
 from sprung.model.diagnosis.record.channels import DiagnosisError, prepare
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import find_law
-from tests.diagnosis_cases import quarter_car, simulate
+from tests.diagnosis_cases import Force, quarter_car, simulate
 
 
 @pytest.fixture(scope="module")
@@ -25,25 +26,73 @@ def clean() -> tuple[Problem, Fit]:
     return baseline(system, signals, declared_noise(system, signals), 700)
 
 
-@pytest.mark.parametrize("factor", [1.05, 1.5, 4.0])
-def test_a_fit_is_never_worse_than_any_point_that_it_saw(
-    clean: tuple[Problem, Fit], factor: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    problem, fit = clean
-    seen = []
-    whole = module._state
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[module._State]:
+    """All points that fits evaluate."""
+    states, whole = [], module._state
 
     def recorded(*args: Any, **kwargs: Any) -> module._State:
-        seen.append(whole(*args, **kwargs))
-        return seen[-1]
+        states.append(whole(*args, **kwargs))
+        return states[-1]
 
     monkeypatch.setattr(module, "_state", recorded)
+    return states
+
+
+@pytest.mark.parametrize("factor", [1.05, 1.5, 4.0])
+def test_a_fit_is_never_worse_than_any_point_that_it_saw(
+    clean: tuple[Problem, Fit], factor: float, seen: list[module._State]
+) -> None:
+    problem, fit = clean
     again = optimise(problem, replace(fit.point, theta=fit.point.theta + np.log(factor)), whitener=fit.whitener)
     objective = again.deviance + float(np.sum(again.point.theta**2))
     # all points but the first, which was weighed before inputs were smoothed
     assert objective <= min(state.value for state in seen[1:]) + 0.5
     assert again.converged
     assert again.chi_square == pytest.approx(fit.chi_square, abs=0.5)
+
+
+def bump_stop(d: float, v: float) -> float:
+    return 6e5 * (max(d - 4e-3, 0.0) + min(d + 4e-3, 0.0))
+
+
+def friction(d: float, v: float) -> float:
+    return 400.0 * float(np.tanh(v / 5e-3))
+
+
+@pytest.mark.parametrize(
+    ("force", "law", "start"), [(bump_stop, "bump_stop", (5e-3, 3e5)), (friction, "coulomb_friction", (250.0, 8e-3))]
+)
+def test_a_fit_of_a_law_converges_and_is_no_worse_than_any_point_that_it_saw_under_its_inputs(
+    force: Force, law: str, start: tuple[float, float], seen: list[module._State]
+) -> None:
+    system = quarter_car()
+    signals = prepare(system, simulate(force, seconds=12, seed=3).values, 100.0).signals
+    problem, base = baseline(system, signals, declared_noise(system, signals), 1000)
+    term = Term(find_law(law), "secondary", start, scales=start)
+    fit = optimise(problem, Point(base.point.theta, (term,), base.point.state))
+    assert fit.converged and fit.iterations <= 10
+    _, working = smoothed(problem, fit.point, Working(fit.whitener), fit.whitener.whitened(fit.spectrum, problem.part))
+    last = module._state(problem, fit.point, working).value
+    points = [one.point for one in seen if len(one.point.terms) == 1]
+    assert len(points) > fit.iterations
+    assert last <= min(module._state(problem, point, working).value for point in points) + 0.5
+
+
+@pytest.mark.parametrize("overshoot", [1.8, 0.6])
+def test_steps_that_miss_by_a_constant_ratio_are_relaxed_to_the_root(overshoot: float) -> None:
+    error, relaxation = np.array([1.0, -2.0, 0.5]), module._Relaxation()
+    for _ in range(3):
+        step = -overshoot * error
+        relaxation = relaxation.after(step)
+        error = error + relaxation.factor * step
+    assert relaxation.factor == pytest.approx(1 / overshoot)
+    assert np.abs(error).max() < 1e-12
+
+
+def test_steps_in_other_directions_are_taken_whole() -> None:
+    relaxation = module._Relaxation().after(np.array([1.0, 0.0])).after(np.array([0.5, 0.6]))
+    assert relaxation.factor == 1.0
 
 
 def test_a_fit_from_its_own_solution_stays_there(clean: tuple[Problem, Fit]) -> None:
