@@ -9,12 +9,24 @@ from typing import Protocol
 import numpy as np
 
 from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
+from sprung.model.system import System
 
 PRIOR_STD = 1.0  # of every log-ratio: nominal values are right within a factor e either way
 
 
 class UnusableWindow(ValueError):
     """A window that cannot be identified at all; the message names the channel and what to do."""
+
+
+def checked_windows(system: System, windows: FloatArray) -> FloatArray:
+    """Windows (B, T, C) as numbers of a system's channels.  Errors: `UnusableWindow`."""
+    windows = np.asarray(windows, dtype=np.float64)
+    channels = system.channels
+    if windows.ndim != 3 or windows.shape[2] != len(channels):
+        raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
+    for column in np.flatnonzero(np.isinf(windows).any(axis=(0, 1))):
+        raise UnusableWindow(f"{channels[column].name}: not finite")
+    return windows
 
 
 @dataclass(slots=True)

@@ -17,7 +17,7 @@ from sprung.model.ambient.sensing import Sensing, sensing
 from sprung.model.ambient.speed import Track
 from sprung.model.ambient.transient import TransientFit, TransientWindow
 from sprung.model.ambient.window import LOAD_STD, AmbientFit, WindowFit
-from sprung.model.identifier import PRIOR_STD, StageTimes, UnusableWindow, without_values
+from sprung.model.identifier import PRIOR_STD, StageTimes, checked_windows, without_values
 from sprung.model.schema import Body
 from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System
@@ -56,7 +56,7 @@ class _WindowByWindow(ABC):
 
         states: ignored, since the excitation is unknown.  Errors: `UnusableWindow`.
         """
-        windows = checked(self.system, windows)
+        windows = checked_windows(self.system, windows)
         begin = time.perf_counter()
         found = [self._estimate(values, None if start is None else start[b]) for b, values in enumerate(windows)]
         self.times = StageTimes(0.0, time.perf_counter() - begin)
@@ -128,17 +128,6 @@ class OutputOnlyIdentifier(_WindowByWindow):
                 if seen.adequate and seen.identifiable.any():
                     return seen
         return _of_transient(fit, P, present, self.rules)
-
-
-def checked(system: System, windows: FloatArray) -> FloatArray:
-    """Windows as numbers of the right shape.  Errors: `UnusableWindow`."""
-    windows = np.asarray(windows, dtype=np.float64)
-    channels = system.channels
-    if windows.ndim != 3 or windows.shape[2] != len(channels):
-        raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
-    for column in np.flatnonzero(np.isinf(windows).any(axis=(0, 1))):
-        raise UnusableWindow(f"{channels[column].name}: not finite")
-    return windows
 
 
 def _of_transient(fit: TransientFit, P: int, present: BoolArray, rules: AmbientWindowRules) -> Estimate:

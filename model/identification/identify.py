@@ -23,7 +23,7 @@ from sprung.model.identification.linearise import PRIOR_STD, prior_std
 from sprung.model.identification.model_uncertainty import ModelUncertainty, model_uncertainty
 from sprung.model.identification.refine import Refined, Refiner, Refines, in_order
 from sprung.model.identification.with_laws import LawRefiner, acting_laws
-from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
+from sprung.model.identifier import Identifies, StageTimes, UnusableWindow, checked_windows
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray, IntArray, MeasurementFault
 from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
@@ -80,7 +80,7 @@ class Identifier:
         A window that lacks all sensors, or inputs without which nothing can be said (`System.needed`), is not
         identified, with the reason.  Errors: `UnusableWindow` for a wrong shape or infinite values.
         """
-        windows = self._checked(windows)
+        windows = checked_windows(self.system, windows)
         usable = self._usable(windows)
         if not usable.all():
             given, wanted = None if start is None else start[usable], None if weigh is None else weigh[usable]
@@ -112,7 +112,7 @@ class Identifier:
         a window has them again, nothing else is tried; and gains and delays, which are taken back first, so that what
         a window says of measurements is linear in what is left of them.  windows, start: see `identify`.
         """
-        windows = self._checked(windows)
+        windows = checked_windows(self.system, windows)
         usable = self._usable(windows)
         if not usable.all():
             some = [its for its, good in zip(known, usable, strict=True) if good] if known else ()
@@ -322,15 +322,6 @@ class Identifier:
     def _with_laws(self) -> bool:
         """Whether laws act that make the system non-linear."""
         return bool(acting_laws(self.system))
-
-    def _checked(self, windows: FloatArray) -> FloatArray:
-        windows = np.asarray(windows, dtype=np.float64)
-        channels = self.system.channels
-        if windows.ndim != 3 or windows.shape[2] != len(channels):
-            raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
-        for column in np.flatnonzero(np.isinf(windows).any(axis=(0, 1))):
-            raise UnusableWindow(f"{channels[column].name}: not finite")
-        return windows
 
     def _needed(self) -> list[tuple[str, list[int]]]:
         """Sets of columns, of each of which a window must contain one at least: what it lacks without, and which."""

@@ -49,6 +49,9 @@ class SpringDamper(NamedTuple):
     damping: Any  # N s/m
 
 
+UNIT_ELEMENT = SpringDamper(1.0, 1.0)  # beside which laws are looked at alone
+
+
 @dataclass(frozen=True, slots=True)
 class Observed:
     """Sizes of an element's motion in a recording, which bound knees, gaps and yield displacements."""

@@ -32,11 +32,6 @@ def undone(shown: FloatArray, response: SensorResponse, sample_rate: float) -> F
     return _filtered(late, sample_rate, response.lag, response.delay, -1) if response.lag or response.delay else late
 
 
-def delayed(signal: FloatArray, seconds: float, sample_rate: float) -> FloatArray:
-    """The signal `seconds` later, band-limited interpolation along the last axis; negative: earlier."""
-    return _filtered(signal, sample_rate, 0.0, seconds, 1)
-
-
 def _filtered(signal: FloatArray, sample_rate: float, lag: float, delay: float, power: int) -> FloatArray:
     """(e^{-s delay} / (1 + s lag))^power of a signal (..., T), power 1 or -1.
 

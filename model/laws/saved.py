@@ -11,14 +11,13 @@ from itertools import product
 
 import numpy as np
 
-from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper
+from sprung.model.laws.base import UNIT_ELEMENT, ElementLaw, Motion, Observed, ParameterSpec
 from sprung.model.laws.formula import formula_law
 from sprung.model.laws.grammar import DECAYS, filtered
 from sprung.model.signals import FloatArray
 
 _TRIED = (0.5, 1.0, 2.0)  # factors on saved values of nonlinear parameters
 _FACTOR = 100.0  # either way, that such a value may be otherwise
-_UNIT = SpringDamper(1.0, 1.0)
 
 
 def saved_law(
@@ -57,7 +56,7 @@ def _linear(law: ElementLaw, values: FloatArray, at: int) -> bool:
     def force(factor: float) -> FloatArray:
         changed = values.copy()
         changed[at] *= factor
-        return np.asarray(law.force(motion, tuple(changed.tolist()), _UNIT), dtype=float)
+        return np.asarray(law.force(motion, tuple(changed.tolist()), UNIT_ELEMENT), dtype=float)
 
     low, middle, high = force(1.0), force(2.0), force(3.0)
     near = 1e-9 * float(np.abs(low).max())

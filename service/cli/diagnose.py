@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.record.channels import TooLittleError
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.laws import CATALOGUE
@@ -57,7 +58,7 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: DiagnoseO
         print(f"sprung: {file}: {error}", file=sys.stderr)
         return 1
     if asked.out is not None:
-        from sprung.service.report.writing import write_report
+        from sprung.service.report.writing import write_report  # matplotlib takes a second
 
         files = write_report(report, system, asked.out)
         if not json_lines:
@@ -97,8 +98,6 @@ def load(file: Path, system: System, dbc: Path | None, start: int | None = None)
 
 
 def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:
-    from sprung.model.diagnosis.api import Options, diagnose
-
     with stages(errors()) as show:
         return diagnose(system, record, Options(file=name), silent_stage if quiet else show)
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from sprung.replay.candatabase import load_database
 from sprung.service.cli.apart import readable
 from sprung.service.cli.console import print_table, width_of_output
 from sprung.service.cli.parameters import parameter_table
@@ -29,8 +30,6 @@ def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[st
         readable(path)
     settings = settings_with(options)
     if settings.dbc is not None:  # rather than with the first recording
-        from sprung.replay.candatabase import load_database
-
         load_database(settings.dbc)
     set_up(settings.log_format, settings.log_level)
     check_folder(settings.data_dir)  # before the model is loaded, which takes seconds

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
+from sprung.model.identification.training import TrainingSettings, train, training_benefit
 from sprung.model.signals import FloatArray
 from sprung.model.system import MANCHESTER, System, load_system
 from sprung.service.can_database import database_of
@@ -34,8 +35,6 @@ TOGETHER = 128  # windows that the reader hands over at once
 
 def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out: Path, changes: dict[str, Any]) -> int:
     """Train, and print the results."""
-    from sprung.model.identification.training import TrainingSettings, train, training_benefit
-
     check_folder(out)
     system = load_system(system_file or MANCHESTER)
     if not system.bodies:

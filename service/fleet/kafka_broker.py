@@ -69,7 +69,7 @@ async def open_kafka(address: str) -> KafkaBroker:
         from aiokafka import AIOKafkaConsumer
         from aiokafka.errors import KafkaError
     except ModuleNotFoundError as error:
-        raise UserError("Kafka needs aiokafka: pip install aiokafka") from error
+        raise UserError("Kafka needs aiokafka: pip install 'sprung[kafka]'") from error
     consumer = AIOKafkaConsumer(
         parts.path.strip("/") or "sprung.estimates",
         bootstrap_servers=parts.netloc,

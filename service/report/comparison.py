@@ -32,7 +32,7 @@ def signals_figure(found: Comparison) -> Figure:
                 (simulated, ink.AFTER, found.names[1]),
                 (measured - simulated, ink.BEFORE, "error"),
             ]
-            rows = _excerpt(measured - simulated)
+            rows = ink.excerpt(measured - simulated, EXCERPT)
             for values, colour, label in lines:
                 left.plot(found.time[rows], values[rows], color=colour, lw=1.0, label=label)
                 f, power = signal.welch(np.nan_to_num(values), found.system.sample_rate, nperseg=min(1024, len(values)))
@@ -79,10 +79,3 @@ def _measured_force(found: Comparison, element: str) -> FloatArray | None:
             measured: FloatArray = found.measured[:, i]
             return measured
     return None
-
-
-def _excerpt(error: FloatArray) -> slice:
-    """The stretch with the largest error."""
-    length = min(EXCERPT, len(error))
-    start = int(np.argmax(np.convolve(np.nan_to_num(error) ** 2, np.ones(length), mode="valid")))
-    return slice(start, start + length)

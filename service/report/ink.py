@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from sprung.model.signals import FloatArray
 
 MEASURED = "#22303c"
 BEFORE = "#d1495b"  # nominal structure
@@ -70,3 +73,11 @@ def engineering(value: float, digits: int = 3) -> str:
         if size >= scale:
             return f"{value / scale:.{digits}g} {prefix}".rstrip()
     return f"{value:.{digits}g}"
+
+
+def excerpt(error: FloatArray, samples: int) -> slice:
+    """The stretch of so many samples with the largest error, of an error (T,) that may lack some."""
+    length = min(samples, len(error))
+    power = np.convolve(np.nan_to_num(error) ** 2, np.ones(length), mode="valid")
+    start = int(np.argmax(power))
+    return slice(start, start + length)

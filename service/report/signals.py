@@ -29,14 +29,6 @@ def _shown_sensors(measured: Array, baseline: Array, augmented: Array) -> list[i
     return sorted(int(i) for i in best)
 
 
-def _excerpt(error: Array) -> slice:
-    """The stretch of EXCERPT samples with the largest error before the law was added."""
-    length = min(EXCERPT, len(error))
-    power = np.convolve(np.nan_to_num(error) ** 2, np.ones(length), mode="valid")
-    start = int(np.argmax(power))
-    return slice(start, start + length)
-
-
 def fit_figure(report: Report, sensors: tuple[str, ...], units: tuple[str, ...], rate: float) -> Figure | None:
     """Rows: sensors; left: an excerpt in time with its errors; right: spectra.  None without the arrays."""
     found = report.plot_data
@@ -68,7 +60,7 @@ def _pretty(unit: str) -> str:
 
 def _time_panel(axes: Axes, time: Array, columns: list[Array], title: str, augmented: bool) -> None:
     measured, before, after = columns
-    part = _excerpt(measured - before)
+    part = ink.excerpt(measured - before, EXCERPT)
     t = time[part]
     axes.plot(t, measured[part], color=ink.MEASURED, lw=1.6, label="measured")
     axes.plot(t, before[part], color=ink.BEFORE, lw=1.0, label="nominal")

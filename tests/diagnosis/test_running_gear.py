@@ -6,7 +6,7 @@ import pytest
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
 from sprung.model.diagnosis.api import diagnose
 from sprung.model.laws import CLOCK_LEAD
-from sprung.model.laws.channel import delayed
+from sprung.model.laws.channel import SensorResponse, passed
 from sprung.model.system import MANCHESTER, load_system
 from tests.named_laws import support_law
 
@@ -69,7 +69,7 @@ def test_a_late_axle_is_a_fault_of_the_measurement() -> None:
     for wheel in ("wheel_21l", "wheel_21r"):
         for quantity in ("displacement", "velocity"):
             i = record.column(f"{wheel}.{quantity}")
-            record.values[:, i] = delayed(record.values[:, i], 0.002, RATE)
+            record.values[:, i] = passed(record.values[:, i], SensorResponse(delay=0.002), RATE)
     report = diagnose(SYSTEM, record)
     assert report.verdict == "sensor_fault"
     assert [(f.location, f.effect) for f in report.findings] == [("wheel_21l|wheel_21r", "axle_delay")]

@@ -80,7 +80,7 @@ def test_wrong_gain_of_one_sensor_is_no_physics() -> None:
     assert (finding.location, finding.effect) == ("bogie_a", "sensor_gain")
     assert finding.parameters[0].value == pytest.approx(0.95, abs=0.005)
     assert finding.runner_up is not None and finding.delta_bic is not None and finding.runner_up[0] != "sensor_gain"
-    assert finding.runner_up[1] > finding.delta_bic + 100
+    assert finding.runner_up[1] is not None and finding.runner_up[1] > finding.delta_bic + 100
 
 
 def test_late_sensor_is_timed_right_although_its_misfit_passed_for_noise() -> None:

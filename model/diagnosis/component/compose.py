@@ -128,11 +128,12 @@ def _parameters(
 
 def _candidates(one: JudgedComponent) -> list[CandidateRow]:
     rows: dict[str, CandidateRow] = {}
-    for step in one.found.steps:
+    for number, step in enumerate(one.found.steps, 1):
         for ranked, piece in ((step.chosen, step.piece), *((rival, rival.last) for rival in step.rivals)):
             delta = step.rival_bic(ranked)
             p_value = chance(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, one.found.tests)
-            rows.setdefault(piece.effect, CandidateRow(one.record.element, piece.effect, ranked.gain, p_value, delta))
+            row = CandidateRow(one.record.element, piece.effect, ranked.gain, p_value, delta, number)
+            rows.setdefault(piece.effect, row)
     for effect, gain in one.found.screened.items():
         rows.setdefault(effect, CandidateRow(one.record.element, effect, gain, chance(gain, 2, one.found.tests)))
     return list(rows.values())[:20]

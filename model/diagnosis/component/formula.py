@@ -17,13 +17,12 @@ from sprung.model.diagnosis.force.piece import HYSTERESIS, STATIC, MotionSizes, 
 from sprung.model.diagnosis.force.search import Ranked, Search, Step, next_laws
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance
-from sprung.model.laws import ElementLaw, Motion, Observed, SpringDamper
+from sprung.model.laws import UNIT_ELEMENT, ElementLaw, Motion, Observed, SpringDamper
 from sprung.model.laws.formula import EFFECT
 from sprung.model.laws.grammar import Shape as Form
 from sprung.model.laws.grammar import forms, formula_cost, law_of
 from sprung.model.signals import FloatArray
 
-_UNIT = SpringDamper(1.0, 1.0)
 _OFF = 2.0  # factor to test whether a parameter is an amplitude
 
 
@@ -77,8 +76,8 @@ def given_piece(law: ElementLaw, values: Sequence[float]) -> FormulaPiece | None
     shape = piece.shape_of(values)
 
     def force(strengths: FloatArray) -> FloatArray:
-        numbers = piece.parameters(strengths, shape, _UNIT)
-        return np.asarray(law.force(Motion(d, v, 0.0, ()), numbers, _UNIT), dtype=float)
+        numbers = piece.parameters(strengths, shape, UNIT_ELEMENT)
+        return np.asarray(law.force(Motion(d, v, 0.0, ()), numbers, UNIT_ELEMENT), dtype=float)
 
     one = np.array([values[i] for i, spec in enumerate(law.parameters) if spec.name in "abc"])
     return piece if np.allclose(force(_OFF * one), _OFF * force(one), rtol=1e-9, atol=1e-12) else None

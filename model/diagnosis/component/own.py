@@ -13,11 +13,10 @@ import numpy as np
 
 from sprung.model.diagnosis.force.motion import ElementMotion
 from sprung.model.diagnosis.force.piece import HYSTERESIS, STATIC, FittedPiece, MotionSizes, Piece, Shape
-from sprung.model.laws import ElementLaw, Law, Observed, SpringDamper, observe
+from sprung.model.laws import UNIT_ELEMENT, ElementLaw, Law, Observed, SpringDamper, observe
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
-_UNIT = SpringDamper(1.0, 1.0)
 _TINY = 1e-300
 
 Scale = Callable[[SpringDamper], float]  # N per strength, factor of a proportional force
@@ -120,8 +119,8 @@ def _scale(law: ElementLaw, values: FloatArray, seen: Observed) -> Scale | None:
     def same(one: FloatArray, other: FloatArray) -> bool:
         return bool(np.allclose(one, other, rtol=1e-6, atol=1e-9 * float(np.max(np.abs(other), initial=0.0))))
 
-    whole = force(_UNIT)
-    if not np.all(np.isfinite(whole)) or (law.strength is not None and not same(force(_UNIT, 2.0), 2.0 * whole)):
+    whole = force(UNIT_ELEMENT)
+    if not np.all(np.isfinite(whole)) or (law.strength is not None and not same(force(UNIT_ELEMENT, 2.0), 2.0 * whole)):
         return None
     stiffer, damped = force(SpringDamper(2.0, 1.0)), force(SpringDamper(1.0, 2.0))
     if same(stiffer, whole) and same(damped, whole):

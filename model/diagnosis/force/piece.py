@@ -16,7 +16,7 @@ import numpy as np
 from sprung.model.diagnosis.force.motion import ElementMotion
 from sprung.model.diagnosis.kinds import EffectKind, kind_of_law
 from sprung.model.diagnosis.rules import RULES, ComponentRules
-from sprung.model.laws import CLOCK_LEAD, ElementLaw, SpringDamper, reversal_step
+from sprung.model.laws import CLOCK_LEAD, UNIT_ELEMENT, ElementLaw, SpringDamper, reversal_step
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.channel import SensorResponse
@@ -28,7 +28,6 @@ from sprung.model.signals import FloatArray
 Values = dict[str, tuple[float, str]]  # value and unit by name
 Shape = Sequence[float]
 
-_UNIT = SpringDamper(1.0, 1.0)
 _MEDIAN_OF_NORMAL = 0.6745  # of the magnitude, over the deviation
 
 
@@ -149,7 +148,8 @@ class Piece:
         total, found = np.zeros(len(motion.time)), []
         for count in range(1, len(self.signs) + 1):
             strengths = (np.arange(len(self.signs)) < count).astype(float)
-            force = force_along(law, of(strengths, shape, _UNIT), d, along.rate, along.time, _UNIT)[::stride]
+            values = of(strengths, shape, UNIT_ELEMENT)
+            force = force_along(law, values, d, along.rate, along.time, UNIT_ELEMENT)[::stride]
             found.append(force - total)
             total = force
         return np.column_stack(found)

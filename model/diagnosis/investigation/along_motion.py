@@ -307,13 +307,19 @@ def _trial(whole: Investigation, index: int) -> Trial | None:
     if turned is None:
         return None
     other = fit_without(whole, index)
-    if other is None:  # it diverges: every sample tells the difference
+    if other is None:  # it diverges: every sample tells the difference, by no number that could be stated
         reduction = gain = fit.count * float(np.log(fit.count))
     else:
         gain, reduction = gain_over(whole.problem, other, fit, rules.quiet)
     term = turned.point.terms[-1]
     return Trial(
-        Candidate(term, reduction, ELEMENT), turned, gain, reduction, gain - cost(turned, rules), len(term.parameters)
+        Candidate(term, reduction, ELEMENT),
+        turned,
+        gain,
+        reduction,
+        gain - cost(turned, rules),
+        len(term.parameters),
+        compared=other is not None,
     )
 
 

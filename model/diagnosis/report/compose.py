@@ -144,12 +144,12 @@ def _changes(outcome: Outcome) -> tuple[str, ...]:
 
 def _candidates(state: Investigation) -> tuple[CandidateRow, ...]:
     rows: dict[tuple[str, str], CandidateRow] = {}
-    for found in state.found:
+    for step, found in enumerate(state.found, 1):
         for trial in [found.trial, *found.trials, *([found.runner_up] if found.runner_up else [])]:
             key = (trial.term.location, trial.term.law.name)
             if key not in rows:
                 p = state.first.p_value(trial.candidate)
-                rows[key] = CandidateRow(*key, trial.candidate.score, p, trial.delta_bic())
+                rows[key] = CandidateRow(*key, trial.candidate.score, p, trial.delta_bic(), step)
     for candidate in state.first.candidates:
         if len(rows) >= 20:
             break
@@ -157,10 +157,13 @@ def _candidates(state: Investigation) -> tuple[CandidateRow, ...]:
             (candidate.location, candidate.effect),
             CandidateRow(candidate.location, candidate.effect, candidate.score, state.first.p_value(candidate)),
         )
-    fitted = [c for c in rows.values() if c.delta_bic is not None]
-    screened = [c for c in rows.values() if c.delta_bic is None]
-    fitted.sort(key=lambda c: c.delta_bic or 0.0)
-    return tuple([*fitted, *screened][:20])
+    return tuple(sorted(rows.values(), key=_step_and_evidence)[:20])
+
+
+def _step_and_evidence(row: CandidateRow) -> tuple[float, float]:
+    """What is fitted first, step by step; what was not compared leads its step."""
+    evidence = -np.inf if row.delta_bic is None else row.delta_bic
+    return (np.inf, 0.0) if row.step is None else (row.step, evidence)
 
 
 def _summary(outcome: Outcome, findings: list[Finding], explained: float | None, calibration: str) -> str:

@@ -34,7 +34,7 @@ def findings_of(outcome: Outcome) -> list[Finding]:
     ranked += [_out_of_order(outcome, index) for index in faulty(state)]
     ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
     if judgement.carried:
-        ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
+        ranked += [(np.inf if f.delta_bic is None else -f.delta_bic, f) for f in _physics(outcome)]
     ranked.sort(key=lambda pair: -pair[0])
     findings = [finding for _, finding in ranked]
     if judgement.verdict == "unknown_physics" and not any(f.kind is EffectKind.UNLISTED for f in findings):
@@ -78,7 +78,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
             effect=term.law.name,
             kind=kind_of(term.law),
             parameters=parameters,
-            p_value=found.p_value,
+            p_value=found.p_value if found.trial.compared else None,
             delta_bic=found.trial.delta_bic(),
             runner_up=None if rival is None else (rival.term.law.name, rival.delta_bic()),
             runner_up_location=None if rival is None else rival.term.location,

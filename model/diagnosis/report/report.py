@@ -89,13 +89,17 @@ class FitFigures:
 
 @dataclass(frozen=True, slots=True)
 class CandidateRow:
-    """One row of the evidence table: a law at a place, as it was tried."""
+    """One row of the evidence table: a law at a place, as it was tried.
+
+    Finding after finding is sought, each beside those before it: a fitted law is compared with others of its step.
+    """
 
     location: str
     effect: str
-    score: float  # chi-square of the screening
+    score: float  # chi-square of the screening, or, of laws read from a force along the motion, the fall of chi-square
     p_value: float  # corrected for multiple testing
-    delta_bic: float | None = None  # against the baseline; None: screened only
+    delta_bic: float | None = None  # against the model of its step without it; None: screened only, or not compared
+    step: int | None = None  # which finding was sought, from 1; None: screened only
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +112,7 @@ class Finding:
     parameters: tuple[LawParameter, ...]
     p_value: float | None  # None: nothing was tested
     delta_bic: float | None  # against the model without this finding; negative: better; None: nothing compared
-    runner_up: tuple[str, float] | None = None  # (effect, delta_bic) of the next best law
+    runner_up: tuple[str, float | None] | None = None  # (effect, delta_bic) of the next best law
     runner_up_location: str | None = None
     family: str | None = None  # of look-alikes, if none of them is clearly better
     # other places at which the same law, or the inverse fault of the set-up, explains the recording equally well

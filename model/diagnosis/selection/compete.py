@@ -45,6 +45,7 @@ class Trial:
     evidence: float  # gain less what its parameters cost
     freedom: int  # parameters of the law and states it adds
     finished: bool = True
+    compared: bool = True  # False: the model without it diverges, and the gain is no more than a rank
 
     @property
     def term(self) -> Term:
@@ -59,9 +60,9 @@ class Trial:
     def named(self) -> bool:
         return self.term.law.named
 
-    def delta_bic(self) -> float:
-        """BIC with the candidate less BIC without."""
-        return bic(self.gain, len(self.term.parameters), self.fit.count)
+    def delta_bic(self) -> float | None:
+        """BIC with the candidate less BIC without; None where the model without it diverges."""
+        return None if not self.compared else bic(self.gain, len(self.term.parameters), self.fit.count)
 
 
 def shortlist(

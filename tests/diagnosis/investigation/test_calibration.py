@@ -16,14 +16,14 @@ from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import find_law
-from sprung.model.laws.channel import delayed
+from sprung.model.laws.channel import SensorResponse, passed
 from sprung.model.system import parse_system
 from tests.diagnosis_cases import MadeRecord, quarter_car, simulate
 
 
 def _of_ordinary_instruments(record: MadeRecord) -> MadeRecord:
     """car_a 1.2 % too high, bogie_a 1 % too low, car_b off by 0.012 m/s^2, bogie_b 0.4 ms late."""
-    record.values[:, 5] = delayed(record.values[:, 5], 4e-4, 100)
+    record.values[:, 5] = passed(record.values[:, 5], SensorResponse(delay=4e-4), 100)
     record.values[:, 2] *= 1.012
     record.values[:, 4] *= 0.99
     record.values[:, 3] += 0.012
