@@ -19,6 +19,7 @@ from sprung.model.ambient.excitation import Prior, Sources, log_level, nodes
 from sprung.model.ambient.periodogram import Spectra
 from sprung.model.signals import BoolArray, FloatArray
 
+# nodes of what is unknown of a track: its level varies most over frequency, a wheel's own share least
 LEVELS_PER_OCTAVE = 2.0
 COHERENCES_PER_OCTAVE = 1.0
 SHARES_PER_OCTAVE = 0.5
@@ -26,7 +27,7 @@ USUAL_SHARE, SHARE_STD = 0.05, 1.5  # median of a wheel's own share; standard de
 LEAST_SHARE = 2e-3  # no wheel follows a delayed profile closer than this
 COHERENCE_STD = 1.0  # of the inverse hyperbolic tangent of the coherence
 LEVEL_STD = 3.0  # of the logarithm of a level, about the one estimated from the sensors' power
-USUAL_COHERENCE = 0.5
+USUAL_COHERENCE = 0.5  # between rails, before a ride: neither alike nor apart
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,9 @@ from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFau
 from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
+# of a delay, and standard deviations: channels of a node that are apart by less than either are late together
+_SAME_CLOCK, _SAME_SIGMAS = 0.3, 3.0
+
 Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre", "side", "own_roll", "own_pitch",
                "reach_x", "reach_y"]  # fmt: skip
 CARGO: tuple[Kind, ...] = ("load", "roll_inertia", "pitch_inertia", "centre", "side")  # another after every stop
@@ -136,7 +139,7 @@ def named(
         if done[h]:
             continue
         members = group == group[h]
-        alike = members & (np.abs(values - values[h]) < np.maximum(0.3 * abs(values[h]), 3 * std[h]))
+        alike = members & (np.abs(values - values[h]) < np.maximum(_SAME_CLOCK * abs(values[h]), _SAME_SIGMAS * std[h]))
         if not alike[members].all():
             alike = np.arange(len(values)) == h
         done |= alike

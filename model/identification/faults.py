@@ -35,7 +35,8 @@ ITERATIONS = 6  # of a refinement that is tried
 TRIED = 8  # windows of a batch; when none of them can be explained, the others are not tried
 _FAR = (0.03, 1e-3, 0.03)  # gain, delay (s), load: beyond, a window is refined there rather than extrapolated
 _EVIDENT = 12.5  # log-likelihood ratio of such a step: five standard deviations
-_BETTER = 0.8  # a correction that leaves more of chi-square than this is none
+_BETTER = 0.8  # of chi-square: by chance one number takes a few of its thousand, so that less than this is no chance
+_DEAF = 0.9  # away from 1: a channel whose gain is nearly none shows noise, and its gain could be anything
 _MARGIN = 2  # samples that a delay costs at either end beyond itself
 _LATE = (-0.045, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.045)  # s: delays too large for a linear step
 _SET_ANEW = 0.2  # of a window: what is left of it, once a delay is taken back from both ends, still tells
@@ -429,8 +430,14 @@ class Explainer:
         return out
 
     def _credible(self, point: FloatArray) -> bool:
-        C = self.channels
-        return bool(np.abs(point[:C]).max() < 0.9 and np.abs(point[C : 2 * C]).max() < 0.2 * self.samples / 100)
+        """Whether gains and delays are such as a window can still tell."""
+        gains, delays = np.abs(point[: 2 * self.channels]).reshape(2, -1)
+        return bool(gains.max() < _DEAF and delays.max() < self._longest)
+
+    @property
+    def _longest(self) -> float:
+        """s, of delays that are taken back."""
+        return _SET_ANEW * self.samples / self.system.sample_rate
 
     def _with_load(self, point: FloatArray, one: Refined) -> FloatArray:
         """The loads that were refined along are part of where the window was linearised."""
@@ -495,7 +502,7 @@ class Explainer:
     @property
     def _far(self) -> tuple[float, ...]:
         """Delays, s, of a clock that was set anew: beyond those that electronics and filters have."""
-        most = _SET_ANEW * self.samples / self.system.sample_rate
+        most = self._longest
         later = np.arange(max(_LATE) + _APART, most, _APART)
         return (*-later[::-1], *later)
 

@@ -27,7 +27,7 @@ from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WE
 from sprung.model.signals import FloatArray
 from sprung.model.work import WorkBudget
 
-ITERATIONS = 6
+ITERATIONS = 6  # of a window with laws; one that has not converged by then says so
 _CONVERGED = 0.3  # standard deviations: a second step this small leaves a far smaller error
 _STATIONARY = 0.3  # standard deviations: after a first step this small the window is at its minimum
 _SLACK = 2.0  # increase of the sum of squares that a step may cause: forces and smoothed inputs converge no closer

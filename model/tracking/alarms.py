@@ -29,6 +29,7 @@ from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
 from sprung.model.tracking.weather import WeatherModel
 
+_TOGETHER = 0.25  # share of a common change that all kinds of a quantity have at least, to be told as one of them all
 HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped", "silent", "noisy")
 
 
@@ -143,7 +144,7 @@ class Attribution:
         for g in np.flatnonzero(odd).tolist():
             quantity = self.kinds[int(np.flatnonzero(model.group == g)[0])]
             alike = [o for o in range(model.groups) if self.kinds[int(np.flatnonzero(model.group == o)[0])] == quantity]
-            everything = all(weather.common[o] * weather.common[g] > 0.25 * weather.common[g] ** 2 for o in alike)
+            everything = all(weather.common[o] * weather.common[g] > _TOGETHER * weather.common[g] ** 2 for o in alike)
             name = f"*.{quantity}" if everything else self._kind_name(g)
             if name not in names:
                 names.add(name)

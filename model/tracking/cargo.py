@@ -16,6 +16,7 @@ import numpy as np
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 
 GAUGE = 0.015  # of a pressure: hysteresis of levelling valves and the gauge
+KNOWN = 0.03  # standard deviation of a ride's load, within which it says something of a gauge that is off by 0.015
 UNKNOWN = 1e6  # variance of a constant before the first ride
 MEMORY = 0.05  # weight of the newest window's pressure in the mean of a ride
 CONTRADICTION = 4.0  # standard deviations between windows and a pressure from which on the pressure is discarded
@@ -67,7 +68,7 @@ def disputed(cargo: Cargo, at: int, *, contradicting: bool) -> Cargo:
 def after_ride(cargo: Cargo, load: FloatArray, variance: FloatArray) -> Cargo:
     """Constants learned from a ride at whose end the loads (L,) are known with `variance`."""
     seen, information = _of_windows(cargo, load, variance)
-    fit = np.isfinite(cargo.pressure) & (information > 1 / 0.03**2)
+    fit = np.isfinite(cargo.pressure) & (information > 1 / KNOWN**2)
     information = np.where(fit, information, 1.0)
     noise = 1 / information + GAUGE**2
     gain = np.where(fit, cargo.variance / (cargo.variance + noise + cargo.scatter), 0.0)
