@@ -85,7 +85,8 @@ def test_what_is_fitted_along_the_measured_motion_begins_near_the_truth() -> Non
     assert force == pytest.approx(FAST, rel=0.1) and slow == pytest.approx(SLOW, rel=0.15)
     assert rate == pytest.approx(CHANGES, rel=0.3)
     simulated = try_optimise(problem, wide, 20, base.whitener)
-    assert simulated is not None and float(np.max(misfit(simulated))) < 1e-3
+    # down to the noise, and to a few percent of the motion: sticking, it depends on the last digits of the values
+    assert simulated is not None and simulated.reduced < 1.2 and float(np.max(misfit(simulated))) < 2e-3
     assert simulated.point.terms[-1].parameters[0] == pytest.approx(FAST, rel=0.01)
 
 
