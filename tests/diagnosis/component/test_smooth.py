@@ -8,7 +8,7 @@ import pytest
 from sprung.model.diagnosis.component.smooth import smooth_serves
 from sprung.model.diagnosis.force.fit import NO_LAWS, refined
 from sprung.model.signals import FloatArray
-from tests.diagnosis.component.test_deviations import D, V, piece, task
+from tests.diagnosis.force.test_deviations import D, V, piece, task
 
 TRAVEL = 0.5 * float(np.ptp(D))
 MIDDLE = 0.5 * float(D.max() + D.min())
