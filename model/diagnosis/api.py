@@ -15,7 +15,7 @@ from sprung.model.diagnosis.investigation.state import Options, Outcome, Progres
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError, prepare
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.report.report import Finding, Report
-from sprung.model.diagnosis.selection.along_measured import disturbed, with_disturbances
+from sprung.model.diagnosis.selection.along_measured import unpushed, with_disturbances
 from sprung.model.laws import ElementLaw
 from sprung.model.laws.following import Covariate, following_law
 from sprung.model.signals import FloatArray
@@ -93,7 +93,7 @@ def _may_be_followed(outcome: Outcome) -> bool:
     if not system.file.inputs:
         return outcome.judgement.rejected
     unknown = outcome.judgement.verdict == "unknown_physics" and not outcome.investigation.setup_faults
-    return unknown and outcome.investigation.problem.process_noise and bool(disturbed(with_disturbances(system)))
+    return unknown and outcome.investigation.problem.process_noise and bool(unpushed(system))
 
 
 def _along_what_was_seen(

@@ -502,8 +502,7 @@ class Explainer:
     @property
     def _far(self) -> tuple[float, ...]:
         """Delays, s, of a clock that was set anew: beyond those that electronics and filters have."""
-        most = self._longest
-        later = np.arange(max(_LATE) + _APART, most, _APART)
+        later = np.arange(max(_LATE) + _APART, self._longest, _APART)
         return (*-later[::-1], *later)
 
     def _late_by(self, window: FloatArray, rows: FloatArray, lates: Sequence[float]) -> FaultExplanation | None:

@@ -115,9 +115,9 @@ class Identifier:
         windows = checked_windows(self.system, windows)
         usable = self._usable(windows)
         if not usable.all():
-            some = [its for its, good in zip(known, usable, strict=True) if good] if known else ()
+            of_usable = [its for its, good in zip(known, usable, strict=True) if good] if known else ()
             given = None if start is None else start[usable]
-            return self._unusable_among(windows, self.examine(windows[usable], weigh[usable], some, given))
+            return self._unusable_among(windows, self.examine(windows[usable], weigh[usable], of_usable, given))
         if len(windows) == 0:
             return []
         windows = self.system.undistorted(windows)

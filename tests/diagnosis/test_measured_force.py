@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
 from sprung.model.diagnosis.api import diagnose
 from sprung.model.diagnosis.selection.along_measured import disturbed, with_disturbances
-from sprung.model.signals import FloatArray
 from sprung.model.system import parse_system
+from tests.diagnosis_cases import MadeRecord
 
 RATE, FINER, SECONDS = 200.0, 10, 12.0
 GAP, HARD = 2.0e-4, 1.5e5  # m, N/m, of the hooks
@@ -30,14 +28,7 @@ sensors:
 """
 
 
-@dataclass(frozen=True)
-class Shaken:
-    values: FloatArray
-    sample_rate: float = RATE
-    lost: int = 0
-
-
-def shaken() -> Shaken:
+def shaken() -> MadeRecord:
     """Force and accelerations, by semi-implicit steps of half a millisecond."""
     random, count, h = np.random.default_rng(8), int(SECONDS * RATE) * FINER, 1 / (RATE * FINER)
     band = butter(3, [3.0, 40.0], "bandpass", fs=RATE * FINER, output="sos")
@@ -54,7 +45,7 @@ def shaken() -> Shaken:
         x1, x2 = x1 + h * v1, x2 + h * v2
     low = butter(8, 80.0, fs=RATE * FINER, output="sos")
     shown = sosfiltfilt(low, rows, axis=0)[::FINER]
-    return Shaken(shown + np.array([0.3, 0.02, 0.03]) * random.standard_normal(shown.shape))
+    return MadeRecord(shown + np.array([0.3, 0.02, 0.03]) * random.standard_normal(shown.shape), RATE)
 
 
 def test_only_bodies_whose_force_nobody_measured_are_disturbed() -> None:

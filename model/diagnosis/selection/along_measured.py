@@ -183,10 +183,14 @@ def _ending(point: Point, term: Term) -> Point:
 def with_disturbances(system: System) -> System:
     """A system with a force input, for what nobody measured, on every body whose force is not measured."""
     nobody = {"kind": "force", "gain_std": 0.0, "offset_std": 0.0}  # there is no instrument that may err
-    pushed = {source.body for source in system.file.inputs.values() if isinstance(source, ForceInput)}
-    free = [body for body in system.bodies if body not in pushed]
-    forces = {_DISTURBANCE + body: ForceInput.model_validate(nobody | {"body": body}) for body in free}
+    forces = {_DISTURBANCE + body: ForceInput.model_validate(nobody | {"body": body}) for body in unpushed(system)}
     return replace(system, file=system.file.model_copy(update={"inputs": {**system.file.inputs, **forces}}))
+
+
+def unpushed(system: System) -> list[str]:
+    """Bodies of a system without a force input."""
+    pushed = {source.body for source in system.file.inputs.values() if isinstance(source, ForceInput)}
+    return [body for body in system.bodies if body not in pushed]
 
 
 def disturbed(system: System) -> set[str]:

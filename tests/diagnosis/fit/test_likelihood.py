@@ -43,13 +43,13 @@ def test_the_reaction_of_a_stop_takes_the_oversampled_axis() -> None:
     term = Term(find_law("bump_stop"), "secondary", (1e-3, 1e7), scales=(1e-3, 1e7))
     coarse, fine = max(_errors(problem, term)), max(_errors(problem, term, fine=True))
     assert coarse > 0.3
-    assert fine < 0.05 and fine < coarse / 8  # at the point that four steps reach
+    assert fine < 0.03
 
 
 def _errors(problem: Problem, term: Term, *, fine: bool = False) -> list[float]:
     """Relative errors of the columns of theta against central finite differences, beside a law."""
     start = Point(true_log_ratios(problem.system), (term,), np.zeros(4))
-    fit = optimise(problem, start, iterations=4)
+    fit = optimise(problem, start, iterations=5)
     same = replace(fit.point.terms[0], parameters=term.parameters)  # beside the equivalent that was fitted
     point, working, step = replace(fit.point, terms=(same,)), Working(fit.whitener), 1e-4
     here = linearise(problem, point, working, fine=fine)
