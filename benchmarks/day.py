@@ -25,8 +25,8 @@ from sprung.benchmarks.generator.timetable import MONTH, REFERENCE, Service, dra
 from sprung.benchmarks.generator.vehicle import read_vehicle
 from sprung.benchmarks.hours import HOUR, full_hours
 from sprung.benchmarks.keeping import keep, kept
-from sprung.model.identification.deviations import CARGO, OWN, deviations
 from sprung.model.identification.identify import Identifier
+from sprung.model.identification.measurements.deviations import CARGO, OWN, deviations
 from sprung.model.signals import Conditions, Deviating, Estimate, FloatArray
 from sprung.model.system import System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState

@@ -19,7 +19,7 @@ from sprung.model.alps import train_fit
 from sprung.model.alps.task import WINDOW, windows
 from sprung.model.alps.train_fit import StateEstimator, TrainConfig
 from sprung.model.alps.train_system import STATE_NOISE, STEPS, TrainData, full_state_system, generate, to_points
-from sprung.model.identification.refine import Refiner
+from sprung.model.identification.refinement.refine import Refiner
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
 

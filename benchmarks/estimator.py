@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from sprung.model.identification.estimator import EstimatorNet, bundled_estimator
+from sprung.model.identification.amortised.estimator import EstimatorNet, bundled_estimator
+from sprung.model.identification.amortised.features import ForceBalance
 from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
-from sprung.model.identification.features import ForceBalance
-from sprung.model.identification.refine import Refiner
+from sprung.model.identification.refinement.refine import Refiner
 from sprung.model.signals import FloatArray
 from sprung.model.system import System, load_system
 

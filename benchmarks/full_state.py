@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.identification.excitation import Runs
-from sprung.model.identification.refine import Refiner
+from sprung.model.identification.refinement.refine import Refiner
 from sprung.model.mechanics import DISPLACEMENT, VELOCITY
 from sprung.model.schema import MotionSensor
 from sprung.model.signals import FloatArray

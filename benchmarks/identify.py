@@ -20,11 +20,11 @@ from torch.utils.flop_counter import FlopCounterMode
 from sprung.benchmarks.bounds import time_domain_bound
 from sprung.benchmarks.full_state import full_state_system
 from sprung.benchmarks.peers import ScipyPeer, ukf_peer
-from sprung.model.identification.estimator import bundled_estimator
+from sprung.model.identification.amortised.estimator import bundled_estimator
+from sprung.model.identification.amortised.features import magnitudes
 from sprung.model.identification.excitation import Runs, draw_log_ratios, simulate_runs
-from sprung.model.identification.features import magnitudes
 from sprung.model.identification.identify import Identifier, load_identifier
-from sprung.model.identification.refine import Refiner
+from sprung.model.identification.refinement.refine import Refiner
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System, load_system
 from sprung.service.monitoring.engine import Engine, load_engine

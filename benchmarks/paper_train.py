@@ -18,8 +18,8 @@ from sprung.model.alps import train_fit
 from sprung.model.alps.task import WINDOW, windows
 from sprung.model.alps.train_fit import StateEstimator, TrainConfig, TrainMethod
 from sprung.model.alps.train_system import STEPS, TRAJECTORIES, TrainData, full_state_system, generate, to_points
-from sprung.model.identification.estimator import Estimator, bundled_estimator, new_estimator, noise_power
-from sprung.model.identification.refine import Refiner
+from sprung.model.identification.amortised.estimator import Estimator, bundled_estimator, new_estimator, noise_power
+from sprung.model.identification.refinement.refine import Refiner
 from sprung.model.system import System, load_system
 
 CONSTANT_METHODS = ("alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors", "alps_known_sensors")

@@ -30,7 +30,7 @@ from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.component.measured import is_component_test
 from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.investigation.diagnose import begun, concluded, under, with_findings
-from sprung.model.diagnosis.investigation.judgement import judged
+from sprung.model.diagnosis.investigation.judgement.judgement import judged
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.rules import RULES, Rules, reason

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.diagnosis.investigation.setup_effects import SETUP_EFFECTS
+from sprung.model.diagnosis.investigation.configuration.effects import SETUP_EFFECTS
 from sprung.model.schema import MotionSensor
 from sprung.model.system import MANCHESTER, System, load_system
 

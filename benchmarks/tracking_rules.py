@@ -21,7 +21,7 @@ import numpy as np
 
 from sprung.benchmarks.day import Pool, drawn, library, pool
 from sprung.benchmarks.sensitivity import figure, quoted
-from sprung.model.identification.deviations import CARGO, OWN, deviations
+from sprung.model.identification.measurements.deviations import CARGO, OWN, deviations
 from sprung.model.signals import Conditions, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System, load_system
 from sprung.model.tracking.alarms import LoadLimit

@@ -12,8 +12,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TOPS = ("model", "replay", "service", "benchmarks")
-INSIDE = ("model", "model.diagnosis")  # folders whose members are drawn one by one
-WIDTH, HEIGHT, GAP_X, GAP_Y = 172, 26, 18, 34
+# folders whose members are drawn one by one
+INSIDE = ("model", "model.diagnosis", "model.diagnosis.investigation", "model.identification")
+WIDTH, HEIGHT, GAP_X, GAP_Y = 262, 26, 18, 34
 
 
 def folder_of(module: str) -> str:

@@ -100,6 +100,31 @@ STAGES = (
     "ambient",
     "api",
 )
+# Inside these packages, too, every name imports only names to its left
+PACKAGES = {
+    "model.identification": (
+        "likelihood",
+        "excitation",
+        "measurements",
+        "refinement",
+        "nonlinear",
+        "fault_isolation",
+        "amortised",
+        "estimates",
+        "model_uncertainty",
+        "identify",
+    ),
+    "model.diagnosis.investigation": (
+        "configuration",
+        "verdict",
+        "state",
+        "formula",
+        "measurements",
+        "search",
+        "judgement",
+        "diagnose",
+    ),
+}
 # Imports inside functions of `model`, each with its reason
 LATE: dict[str, str] = {
     "model/signal_filters.py:_signal": "half a second of processor time that services and replicas may never need",
@@ -219,7 +244,7 @@ def test_folders_stand_above_those_that_they_import() -> None:
     for name, targets in edges().items():
         graph[folder_of(name)] |= {folder_of(target) for target in targets}
     whole = {name: {target for target in targets if target != name} for name, targets in graph.items()}
-    for package in ("model", "model.diagnosis"):  # their own files hold nothing
+    for package in ("model", "model.diagnosis", *PACKAGES):  # their own files hold nothing
         whole.pop(package, None)
     assert circle({name: targets & set(whole) for name, targets in whole.items()}) == []
 
@@ -260,6 +285,18 @@ def test_the_diagnosis_is_built_in_one_order() -> None:
             if name.startswith("model.diagnosis.") and target.startswith("model.diagnosis."):
                 upper, lower = name.split(".")[2], target.split(".")[2]
                 if STAGES.index(lower) > STAGES.index(upper):
+                    wrong.append(f"{name} imports {target}")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_large_packages_are_built_in_one_order(package: str) -> None:
+    order, depth, wrong = PACKAGES[package], len(package.split(".")), []
+    for name, targets in edges().items():
+        for target in targets:
+            if name.startswith(f"{package}.") and target.startswith(f"{package}."):
+                upper, lower = name.split(".")[depth], target.split(".")[depth]
+                if order.index(lower) > order.index(upper):
                     wrong.append(f"{name} imports {target}")
     assert wrong == []
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from sprung.model.alps.config import NetworkConfig
 from sprung.model.alps.task import WINDOW, Task
-from sprung.model.identification.features import magnitudes
+from sprung.model.identification.amortised.features import magnitudes
 
 Features = Callable[[Tensor], Tensor]
 

@@ -1,9 +1,9 @@
 """Training of the visual tasks: first the frame autoencoder, then each method on its embeddings.
 
-Checkpoints, learning-rate schedule and seeding are those of `model.identification.training`: every update draws from
-(seed, step), so that an interrupted run ends in the same weights as one that was not.  Tensors that come from a file
-are copied, for the memory they are mapped to is not aligned like torch's own, and sums of the same numbers then differ
-in their last bit.
+Checkpoints, learning-rate schedule and seeding are those of `model.identification.amortised.training`: every update
+draws from (seed, step), so that an interrupted run ends in the same weights as one that was not.  Tensors that come
+from a file are copied, for the memory they are mapped to is not aligned like torch's own, and sums of the same numbers
+then differ in their last bit.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sprung.model.alps.frames import FrameAutoencoder
 from sprung.model.alps.losses import loss_of, picture_loss, state_loss
 from sprung.model.alps.network import Network
 from sprung.model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
-from sprung.model.identification.training import TrainingRun
+from sprung.model.identification.amortised.training import TrainingRun
 
 _STREAMS = {"train": 0, "test": 1, "unseen": 2, "below": 3}
 

@@ -20,8 +20,8 @@ from sprung.model.alps.fit import TimeLimit
 from sprung.model.alps.task import WINDOW, Task, windows
 from sprung.model.alps.train_estimator import LogRatioEstimator
 from sprung.model.alps.train_system import STEPS, TrainData, smoothed, train_task
-from sprung.model.identification.features import magnitudes
-from sprung.model.identification.training import TrainingRun
+from sprung.model.identification.amortised.features import magnitudes
+from sprung.model.identification.amortised.training import TrainingRun
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
 

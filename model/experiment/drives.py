@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 
 from sprung.model.experiment.menu import BenchSignal, MenuRun
 from sprung.model.identification.excitation import ERRI_LOW, simulate_runs
-from sprung.model.identification.with_laws import without_laws
+from sprung.model.identification.nonlinear.with_laws import without_laws
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import drives_of
 from sprung.model.system import System

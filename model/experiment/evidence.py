@@ -21,9 +21,9 @@ import numpy as np
 
 from sprung.model.experiment.drives import loaded, run_inputs
 from sprung.model.experiment.menu import MenuRun
-from sprung.model.identification.linearise import PRIOR_STD
-from sprung.model.identification.refine import Refined, Refiner
-from sprung.model.identification.with_laws import LawRefiner, acting_laws
+from sprung.model.identification.likelihood.linearise import PRIOR_STD
+from sprung.model.identification.nonlinear.with_laws import LawRefiner, acting_laws
+from sprung.model.identification.refinement.refine import Refined, Refiner
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sprung.model.address import LawSetting, LawValue
-from sprung.model.identification.law_forces import LawAlongMotion
+from sprung.model.identification.nonlinear.forces import LawAlongMotion
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.base import observe
 from sprung.model.signals import FloatArray

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sprung.model.identification.frequency import FrequencyModel
+from sprung.model.identification.likelihood.frequency import FrequencyModel
 from sprung.model.schema import ForceInput
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import drives_of

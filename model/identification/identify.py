@@ -13,16 +13,16 @@ import numpy as np
 
 from sprung.model.ambient.foreseen import foreseen
 from sprung.model.ambient.identify import AmbientIdentifier, OutputOnlyIdentifier
-from sprung.model.identification.any_inputs import RefinerOfAnyInputs
-from sprung.model.identification.deviations import deviations
+from sprung.model.identification.amortised.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.estimates import EXCITED, estimates, not_identified
-from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.faults import Explainer, FaultExplanation, fits
-from sprung.model.identification.linearise import PRIOR_STD, prior_std
+from sprung.model.identification.fault_isolation.faults import Explainer, FaultExplanation, fits
+from sprung.model.identification.likelihood.linearise import PRIOR_STD, prior_std
+from sprung.model.identification.measurements.deviations import deviations
 from sprung.model.identification.model_uncertainty import ModelUncertainty, model_uncertainty
-from sprung.model.identification.refine import Refined, Refiner, Refines, in_order
-from sprung.model.identification.with_laws import LawRefiner, acting_laws
+from sprung.model.identification.nonlinear.with_laws import LawRefiner, acting_laws
+from sprung.model.identification.refinement.any_inputs import RefinerOfAnyInputs
+from sprung.model.identification.refinement.refine import Refined, Refiner, Refines, in_order
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow, checked_windows
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray, IntArray, MeasurementFault
 from sprung.model.simulate.drives import ORDERS, drives_of
@@ -106,7 +106,7 @@ class Identifier:
         start: FloatArray | None = None,
     ) -> list[Estimate]:
         """As a tracker wants it: loads are refined along, the windows `weigh` (B,) say what they know of gains and
-        delays, and a wrong measurement is looked for where windows do not fit (`model.identification.faults`).
+        delays, and a wrong measurement is looked for where windows do not fit (`fault_isolation.faults`).
 
         known: frozen, reversed and exchanged channels that earlier windows of the vehicle had, for each window: where
         a window has them again, nothing else is tried; and gains and delays, which are taken back first, so that what

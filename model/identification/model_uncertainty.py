@@ -26,11 +26,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sprung.model.identification.calibration import DeviationSensitivity
-from sprung.model.identification.deviations import deviations
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.gauss_newton import Linearisation, WindowBatch
-from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows
+from sprung.model.identification.likelihood.gauss_newton import Linearisation, WindowBatch
+from sprung.model.identification.likelihood.linearise import PRIOR_STD, WindowModel, as_rows
+from sprung.model.identification.measurements.calibration import DeviationSensitivity
+from sprung.model.identification.measurements.deviations import deviations
 from sprung.model.laws import ElementLaw
 from sprung.model.schema import ElementSensor, SystemFile
 from sprung.model.signals import FloatArray
@@ -54,7 +54,7 @@ class ModelUncertainty:
     """Covariances of the estimates due to uncertain constants and to sampling."""
 
     parameters: FloatArray  # of the log-ratios, shape (P, P)
-    deviations: FloatArray  # of gains, delays and loads, see `model.identification.deviations`, shape (H, H)
+    deviations: FloatArray  # of gains, delays and loads, see `measurements.deviations`, shape (H, H)
 
     @property
     def none(self) -> bool:

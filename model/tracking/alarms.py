@@ -18,7 +18,7 @@ from itertools import takewhile
 
 import numpy as np
 
-from sprung.model.identification.deviations import Deviation, named
+from sprung.model.identification.measurements.deviations import Deviation, named
 from sprung.model.signals import FaultKind, FloatArray, IntArray, MeasurementFault
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import weather as weathers

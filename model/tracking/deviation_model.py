@@ -1,7 +1,7 @@
 """Constants of the deviations of one vehicle: prior, random walk, directions of jumps, thresholds.
 
-H deviations (gains, delays, loads, body constants; `model.identification.deviations`), V directions in which a jump is
-tested: each deviation alone, and what several channels may have in common.
+H deviations (gains, delays, loads, body constants; `identification.measurements.deviations`), V directions in which a
+jump is tested: each deviation alone, and what several channels may have in common.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sprung.model.identification.deviations import CARGO, OWN, Deviation, shared_directions
+from sprung.model.identification.measurements.deviations import CARGO, OWN, Deviation, shared_directions
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.tracking.middle import median
 from sprung.model.tracking.rules import TRACKING_RULES, JumpRules

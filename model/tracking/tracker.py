@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from sprung.model.identification.deviations import OWN, Deviation, named
+from sprung.model.identification.measurements.deviations import OWN, Deviation, named
 from sprung.model.signals import BuiltOtherwise, Conditions, Estimate, FloatArray, IntArray, MeasurementFault
 from sprung.model.tracking import cargo as cargos
 from sprung.model.tracking import changes as change_test

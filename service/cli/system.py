@@ -14,7 +14,7 @@ from rich.text import Text
 
 from sprung.model.exchange.matrices import read_matrices
 from sprung.model.identification.identify import identifiability
-from sprung.model.identification.linearise import PRIOR_STD
+from sprung.model.identification.likelihood.linearise import PRIOR_STD
 from sprung.model.schema import ForceInput
 from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.systemfile import json_schema

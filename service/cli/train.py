@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from sprung.model.identification.training import TrainingSettings, train, training_benefit
+from sprung.model.identification.amortised.training import TrainingSettings, train, training_benefit
 from sprung.model.signals import FloatArray
 from sprung.model.system import MANCHESTER, System, load_system
 from sprung.service.can_database import database_of

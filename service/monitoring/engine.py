@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from sprung.model.identification.deviations import deviations
+from sprung.model.identification.measurements.deviations import deviations
 from sprung.model.identifier import Identifies
 from sprung.model.signals import Estimate, FloatArray, MeasurementFault
 from sprung.model.system import MANCHESTER, System, load_system

@@ -30,7 +30,7 @@ from sprung.model.alps.train_system import (
     to_states,
     train_task,
 )
-from sprung.model.identification.refine import Refiner
+from sprung.model.identification.refinement.refine import Refiner
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
 from sprung.service.errors import UserError

@@ -12,7 +12,7 @@ from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.timetable import Service, draw_timetable
 from sprung.benchmarks.generator.vehicle import read_vehicle
 from sprung.benchmarks.through import through
-from sprung.model.identification.deviations import CARGO, deviations
+from sprung.model.identification.measurements.deviations import CARGO, deviations
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
 from sprung.service.monitoring.engine import load_engine

@@ -117,11 +117,11 @@ def test_rows_of_the_training_reach_what_trains_them() -> None:
         ("sprung.model.alps.fit", "_update_loss"),
         ("sprung.model.alps.losses", "tempered"),
         ("sprung.model.alps.rollout", "runge_kutta"),
-        ("sprung.model.identification.training", "TrainingRun"),
+        ("sprung.model.identification.amortised.training", "TrainingRun"),
         ("sprung.model.alps.config", "_QUICK"),
     ):
         assert place in reached
-    assert ("sprung.model.identification.training", "training_benefit") not in reached
+    assert ("sprung.model.identification.amortised.training", "training_benefit") not in reached
 
 
 def test_the_trains_vehicle_has_no_law_that_its_rows_would_depend_on() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.model.identification.estimator import bundled_estimator
+from sprung.model.identification.amortised.estimator import bundled_estimator
 from sprung.model.laws import ElementLaw, Motion, SpringDamper
 from sprung.model.schema import SystemFileError
 from sprung.model.system import System, load_system, parse_system

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from sprung.model.identification.deviations import CARGO, OWN, deviations
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
-from sprung.model.identification.refine import Refiner
+from sprung.model.identification.measurements.deviations import CARGO, OWN, deviations
+from sprung.model.identification.refinement.refine import Refiner
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import ElementValues, LinearSimulator
 from sprung.model.simulate.loading import by_inertia, load_terms

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.model.identification.deviations import Deviation
+from sprung.model.identification.measurements.deviations import Deviation
 from sprung.model.signals import Deviating
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from sprung.model.identification.deviations import Deviation
+from sprung.model.identification.measurements.deviations import Deviation
 from sprung.model.signals import Conditions, Deviating
 from sprung.model.system import parse_system
 from sprung.model.tracking.alarms import LoadLimit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.model.identification.deviations import Deviation
+from sprung.model.identification.measurements.deviations import Deviation
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking.deviation_model import model_of
 from sprung.model.tracking.rules import TRACKING_RULES

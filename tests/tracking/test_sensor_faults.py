@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sprung.model.identification.deviations import Deviation
+from sprung.model.identification.measurements.deviations import Deviation
 from sprung.model.signals import Deviating, Estimate, FloatArray, MeasurementFault
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking.deviation_model import model_of

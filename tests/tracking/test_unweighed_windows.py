@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sprung.model.identification.deviations import Deviation
+from sprung.model.identification.measurements.deviations import Deviation
 from sprung.model.signals import Deviating, FloatArray
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking.tracker import Tracker, TrackerSettings

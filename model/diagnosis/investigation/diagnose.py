@@ -9,28 +9,31 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
-from sprung.model.diagnosis.investigation.along_motion import with_laws_along_motion
-from sprung.model.diagnosis.investigation.common_delay import common_delay
-from sprung.model.diagnosis.investigation.excess_noise import noise_faults
-from sprung.model.diagnosis.investigation.floor import leaves_more_than_noise
-from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
-from sprung.model.diagnosis.investigation.judgement import (
+from sprung.model.diagnosis.investigation.configuration.effects import Hypothesis
+from sprung.model.diagnosis.investigation.configuration.fitted import FittedSetup
+from sprung.model.diagnosis.investigation.configuration.search import without_setup_faults
+from sprung.model.diagnosis.investigation.judgement.judgement import (
     another_structure,
     judged,
     unmeasured_share,
 )
-from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covariance
-from sprung.model.diagnosis.investigation.named_laws import with_laws_together, with_named_laws
-from sprung.model.diagnosis.investigation.next_finding import next_finding
-from sprung.model.diagnosis.investigation.redundant import without_redundant
-from sprung.model.diagnosis.investigation.restated import restated
-from sprung.model.diagnosis.investigation.setup import without_setup_faults
-from sprung.model.diagnosis.investigation.setup_effects import Hypothesis
-from sprung.model.diagnosis.investigation.setup_fitted import FittedSetup
-from sprung.model.diagnosis.investigation.significance import (
+from sprung.model.diagnosis.investigation.judgement.misfit_covariance import misfit_covariance
+from sprung.model.diagnosis.investigation.judgement.significance import (
     shared_gain_covariance,
     without_insignificant,
     without_refuted,
+)
+from sprung.model.diagnosis.investigation.measurements.common_delay import common_delay
+from sprung.model.diagnosis.investigation.measurements.excess_noise import noise_faults
+from sprung.model.diagnosis.investigation.measurements.floor import leaves_more_than_noise
+from sprung.model.diagnosis.investigation.measurements.inputs import best_input_fault, compensate, nominal
+from sprung.model.diagnosis.investigation.search.along_motion import with_laws_along_motion
+from sprung.model.diagnosis.investigation.search.named_laws import with_laws_together, with_named_laws
+from sprung.model.diagnosis.investigation.search.next_finding import next_finding
+from sprung.model.diagnosis.investigation.search.redundant import without_redundant
+from sprung.model.diagnosis.investigation.search.restated import restated
+from sprung.model.diagnosis.investigation.search.widened import (
+    form_covariance,
 )
 from sprung.model.diagnosis.investigation.state import (
     InputFault,
@@ -40,9 +43,6 @@ from sprung.model.diagnosis.investigation.state import (
     Outcome,
     Progress,
     Recorded,
-)
-from sprung.model.diagnosis.investigation.widened import (
-    form_covariance,
 )
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform

@@ -9,7 +9,7 @@ from typing import Protocol
 from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.investigation.setup_fitted import SetupFault
+from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.record.signals import Noise, Signals

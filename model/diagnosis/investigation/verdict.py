@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.setup_effects import SetupEffect
+from sprung.model.diagnosis.investigation.configuration.effects import SetupEffect
 from sprung.model.diagnosis.kinds import EffectKind, kind_of_law
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.laws import Law

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.calibration import calibration_indices
-from sprung.model.diagnosis.investigation.setup_fitted import SetupFault
+from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
+from sprung.model.diagnosis.investigation.measurements.calibration import calibration_indices
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome, Recorded
 from sprung.model.diagnosis.report.advice import LOST_PHASE, nothing_fits, search_ended, undecided
 from sprung.model.diagnosis.report.calibration import calibration_of, in_words

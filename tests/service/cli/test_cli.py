@@ -19,7 +19,7 @@ import pytest
 
 from sprung.benchmarks import BENCHMARKS
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
-from sprung.model.identification.estimator import Estimator, new_estimator
+from sprung.model.identification.amortised.estimator import Estimator, new_estimator
 from sprung.model.system import MANCHESTER, System
 from sprung.service.cli import describe, main
 from sprung.service.cli.app import app
@@ -450,7 +450,7 @@ def test_train_takes_several_recordings_and_tells_how_far_it_is(
         asked.update(windows=recordings.shape, records=settings.records, out=out)
         return Estimator(system, new_estimator(system))
 
-    monkeypatch.setattr("sprung.model.identification.training.train", train)
+    monkeypatch.setattr("sprung.model.identification.amortised.training.train", train)
     arguments = ["train", "--system", str(csv_system), "--out", str(tmp_path), "--records", "5"]
     assert main([*arguments, "--recordings", str(healthy), str(healthy)]) == 0
     assert asked == {"windows": (2 * 79, 100, 28), "records": 5, "out": tmp_path}

@@ -1,0 +1,173 @@
+"""Judgement of an investigation: held-out errors, their noise floor, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.investigation.configuration.effects import WRONG_BODY
+from sprung.model.diagnosis.investigation.measurements.calibration import faulty, within_tolerance
+from sprung.model.diagnosis.investigation.measurements.floor import bounded, held_out_errors
+from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
+from sprung.model.diagnosis.kinds import EffectKind
+from sprung.model.diagnosis.record.signals import Noise
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
+from sprung.model.diagnosis.selection.holdout import FreeRun
+from sprung.model.laws import Law
+from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
+from sprung.model.signals import FloatArray
+
+_BAND = 0.8  # of the residual's power, in the band that is reported
+
+
+def judged(
+    state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...], ended: str = ""
+) -> Judgement:
+    """Errors and verdict of an investigation.
+
+    before, after: free runs without and with the findings.  ended: the limit that ended the search, or empty.  If
+    laws act along the measured motion and the free run loses its phase, its errors are not informative; the verdict
+    is then based on the unmeasured forces relative to the inertia forces.
+    """
+    rules = state.options.rules.verdict
+    noise = bounded(state)
+    floor = state.held.noise_rms(state.fit, noise)
+    errors = held_out_errors(before, after, floor, rules)
+    lost = state.problem.process_noise and after.nrmse > rules.rejected
+    deciding = _deciding_errors(state, errors, noise, lost=lost)
+    faults, physics = _kinds_of_faults(state, noisy), _kinds_of_physics(state)
+    other = another_structure(state, deciding)
+    verdict = verdict_of(faults + physics, deciding, rules, other_structure=other, ended=bool(ended))
+    error, unknown = float(np.sqrt(np.mean(deciding.after**2))), verdict == "unknown_physics"
+    rejected = bool(other) or (unknown and error > rules.rejected)
+    return Judgement(
+        errors=errors,
+        verdict=verdict,
+        floor=floor,
+        error=error,
+        rejected=rejected,
+        lost_phase=lost,
+        nothing_fits=rejected or (unknown and lost and error**2 > rules.gross),
+        parts=changed_parts(state) + _out_of_order(state) if other else 0,
+        carried=_carries(verdict, physics),
+        ended=ended,
+        place=_place(state),
+        where=_words(state, errors, after),
+    )
+
+
+def _deciding_errors(state: Investigation, errors: HeldOutErrors, noise: Noise, *, lost: bool) -> HeldOutErrors:
+    """The errors on which the verdict is based; lost: the free run loses its phase."""
+    if lost:
+        shares = [unmeasured_share(fit, level.force) for fit, level in _compared(state, noise)]
+        return HeldOutErrors(*(np.array([share]) for share in shares))
+    if state.setup_faults:  # corrected before the first fit, from which the errors count
+        worst = np.sqrt(state.setup_faults[0].before / len(errors.before))
+        return replace(errors, before=np.maximum(errors.before, worst))
+    return errors
+
+
+def _kinds_of_faults(state: Investigation, noisy: tuple[NoiseFault, ...]) -> list[EffectKind]:
+    """Kinds of all faults beside the findings of the search."""
+    kinds = [kind_of(fault.effect) for fault in state.setup_faults]
+    kinds += [_kind(state, fault.term, fault.term.law) for fault in state.input_faults]
+    kinds += [kind_of(state.fit.point.terms[index].law) for index in faulty(state)]
+    return kinds + [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
+
+
+def _kinds_of_physics(state: Investigation) -> list[EffectKind]:
+    """Kinds of the findings of the search, best first."""
+    terms = state.fit.point.terms[state.given :]
+    return [_kind(state, term, found.trial.term.law) for found, term in zip(state.found, terms, strict=True)]
+
+
+def _carries(verdict: Verdict, physics: list[EffectKind]) -> bool:
+    """Whether the findings carry the verdict: they explain more than they leave."""
+    kinds = [kind for kind in physics if kind is not EffectKind.NUISANCE]
+    return verdict != "unknown_physics" or not kinds or kinds[0] is EffectKind.UNLISTED
+
+
+def _kind(state: Investigation, term: Term, law: Law) -> EffectKind:
+    """The kind of a finding; calibration errors within tolerance are nuisances."""
+    return EffectKind.NUISANCE if within_tolerance(state, term) else kind_of(law)
+
+
+def changed_parts(state: Investigation) -> int:
+    """Number of structural changes among the findings: moved elements and linear parts."""
+    moved = sum(fault.effect is WRONG_BODY for fault in state.setup_faults)
+    return moved + sum(found.trial.term.law.part for found in state.found)
+
+
+def _out_of_order(state: Investigation) -> int:
+    """Number of masses and instruments that are off beyond their tolerances."""
+    if state.calibrations:
+        return len(faulty(state))
+    return sum(found.trial.term.law.error_of_value for found in state.found)
+
+
+def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
+    """Whether so many changes were found that they imitate another structure than the file's.
+
+    More structural ones than a few in any case, more than one if they leave a significant error (`errors`): together
+    linear parts approximate any linear structure, and true ones would leave noise.  Masses and instruments off beyond
+    their tolerances count, too, where they are most of all, are beside more than one structural change, or leave much.
+    """
+    rules, parts = state.options.rules.verdict, changed_parts(state)
+    if errors is None or parts > rules.parts:
+        return parts > rules.parts
+    off = _out_of_order(state)
+    share = errors.explained(rules)
+    left = bool(np.any(errors.unexplained(rules) > 0))
+    if (state.calibrations and 2 * off > state.calibrations) or (parts > 1 and (left or off > 0)):
+        return True
+    much = left and share is not None and share < 1 - rules.parts_leave
+    return much and parts + off > rules.parts
+
+
+def _compared(state: Investigation, noise: Noise) -> tuple[tuple[Fit, Noise], ...]:
+    """Fits and force noise before, after, and as far as bounded."""
+    return (state.base, state.base.noise), (state.fit, state.fit.noise), (state.fit, noise)
+
+
+def unmeasured_share(fit: Fit, force: FloatArray) -> float:
+    """Unmeasured forces, as noise of the measured ones, relative to the inertia forces, rms over rms."""
+    structure = fit.forward.plant.structure
+    inertia = structure.mass * fit.forward.part.grid.inverse(fit.motions.acceleration)
+    return float(np.sqrt(np.sum(structure.F**2 @ force**2) / np.sum(np.mean(inertia**2, axis=0))))
+
+
+def _place(state: Investigation) -> str:
+    """Location of the highest score of the remaining misfit."""
+    here = [candidate for candidate in state.last.candidates if candidate.family in (ELEMENT, UNNAMED)] or list(
+        state.last.candidates
+    )
+    return max(here, key=lambda candidate: candidate.score).location if here else next(iter(state.system.elements), "")
+
+
+def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun) -> str:
+    """Place, size and frequencies of the misfit, in words; empty without misfit."""
+    left = errors.unexplained(state.options.rules.verdict)
+    if not np.any(left > 0):
+        return ""
+    worst = int(np.argmax(left))
+    error = after.measured[:, worst] - after.simulated[:, worst]
+    low, high = main_band(error, state.signals.sample_rate)
+    return (
+        f"{100 * errors.after[worst]:.0f} % of {state.signals.sensor_names[worst]} "
+        f"({100 * errors.floor[worst]:.1f} % is noise), most of it at {low:.2g} to {high:.2g} Hz; "
+        f"most suspicious is {_place(state).replace('|', ' and ')}"
+    )
+
+
+def main_band(error: FloatArray, sample_rate: float) -> tuple[float, float]:
+    """Band with most of the power of an error (T,), Hz."""
+    power = np.abs(np.fft.rfft(error - np.mean(error))) ** 2
+    share = np.cumsum(power) / max(float(np.sum(power)), 1e-300)
+    frequency = np.fft.rfftfreq(len(error), 1 / sample_rate)
+    ends = [(1 - _BAND) / 2, (1 + _BAND) / 2]
+    low, high = (float(frequency[min(int(np.searchsorted(share, end)), len(frequency) - 1)]) for end in ends)
+    return low, high

@@ -1,0 +1,52 @@
+"""The noise floor of an investigation on its held-out part, and whether more than that is left."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.investigation.measurements.excess_noise import upper_ratio
+from sprung.model.diagnosis.investigation.state import Investigation
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise
+from sprung.model.diagnosis.record.signals import Noise, declared_noise
+from sprung.model.diagnosis.rules import RULES, VerdictRules
+from sprung.model.diagnosis.selection.holdout import FreeRun
+from sprung.model.signals import FloatArray
+
+
+def leaves_more_than_noise(state: Investigation) -> bool:
+    """Whether the findings so far leave an unexplained share."""
+    run, rules = state.held.run(state.fit.point), state.options.rules.verdict
+    errors = held_out_errors(run, run, state.held.noise_rms(state.fit, bounded(state)), rules)
+    return bool(np.any(errors.unexplained(rules) > 0))
+
+
+def held_out_errors(before: FreeRun, after: FreeRun, floor: FloatArray, rules: VerdictRules) -> HeldOutErrors:
+    """Errors of free runs without and with the findings beside the noise (C,) that is expected, rms."""
+    size = np.sqrt(np.mean(before.measured**2, axis=0))
+    expected = floor / np.where(size > 0, size, 1.0)
+    return HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after, rules))
+
+
+def bounded(state: Investigation) -> Noise:
+    """Noise levels for the floor: estimated ones, at most as declared or observed above the compared band."""
+    prepared = state.prepared.signals
+    declared = declared_noise(state.system, prepared, state.options.rules)
+    present = np.isin(prepared.sensor_index, state.signals.sensor_index)
+    known = declared.sensors[present]
+    seen = upper_ratio(state, known) * known
+    noise, slack = state.problem.noise, state.options.rules.verdict.slack
+    sensors = bounded_noise(noise.sensors, known, np.where(np.isfinite(seen), seen, 0.0), slack)
+    force = bounded_noise(noise.force, declared.force, np.zeros(len(noise.force)), slack)
+    return replace(noise, sensors=sensors, force=force)
+
+
+def realised_floor(expected: FloatArray, after: FreeRun, rules: VerdictRules = RULES.verdict) -> FloatArray:
+    """Noise floor of each sensor on the held-out samples themselves.
+
+    `expected` is the mean for the estimated noise.  If the error of the free run agrees with it within sampling error,
+    it is noise, and the floor of these samples; if it is smaller, so is the noise, which is part of it.
+    """
+    spread = rules.spread * np.sqrt(1 / (2 * len(after.measured)))
+    return np.where(after.per_sensor / expected - 1 < spread, after.per_sensor, expected)

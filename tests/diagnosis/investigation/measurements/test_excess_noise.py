@@ -1,0 +1,67 @@
+"""Which channels count as noisier than their peers."""
+
+import numpy as np
+import pytest
+
+from sprung.benchmarks.shaken import building
+from sprung.model.diagnosis.investigation.diagnose import begun
+from sprung.model.diagnosis.investigation.measurements.excess_noise import is_what_is_left, outliers, upper_ratio
+from sprung.model.diagnosis.investigation.measurements.floor import realised_floor
+from sprung.model.diagnosis.investigation.state import Options
+from sprung.model.diagnosis.record.signals import declared_noise
+from sprung.model.diagnosis.rules import RULES
+from sprung.model.diagnosis.selection.holdout import FreeRun
+
+NAMES = ["a", "b", "c", "d", "e"]
+EVERY = np.ones(5, dtype=bool)
+RULE = RULES.noise
+
+
+def test_chance_hardly_ever_makes_an_outlier() -> None:
+    random, bins, found = np.random.default_rng(1), 400, 0
+    for _ in range(500):
+        level = np.sqrt(np.mean(random.exponential(1.0, (bins, 5)), axis=0))
+        found += len(outliers(NAMES, level, EVERY, bins, RULE))
+    assert found == 0
+
+
+@pytest.mark.parametrize("usual", [0.5, 1.0, 3.0])
+def test_a_noisy_channel_is_found_whatever_all_have_in_common(usual: float) -> None:
+    ratio = usual * np.array([1.01, 0.99, 1.5, 1.0, 1.02])
+    (found,) = outliers(NAMES, ratio, EVERY, 400, RULE)
+    assert found.location == "c" and found.ratio == pytest.approx(1.5 * usual)
+    assert found.usual == pytest.approx(1.005 * usual)
+    assert found.sigmas == pytest.approx(np.log(1.5 / 1.005) * np.sqrt(800))
+    assert found.p_value < 1e-6
+
+
+def test_what_ends_with_the_band_is_no_noise_and_two_channels_cannot_be_told_apart() -> None:
+    ratio = np.array([1.0, 1.0, 2.0, 1.0, 1.0])
+    assert not outliers(NAMES, ratio, EVERY & (ratio < 2), 400, RULE)
+    assert not outliers(["a", "b"], ratio[1:3], EVERY[:2], 400, RULE)
+
+
+def test_a_significant_ratio_that_no_workshop_would_mind_is_none() -> None:
+    assert not outliers(NAMES, np.array([1.0, 1.0, 0.99 * RULE.least, 1.0, 1.0]), EVERY, 1e6, RULE)
+    assert not outliers(NAMES, np.array([1.0, 1.0, 1.5, 1.0, 1.0]), EVERY, 20, RULE)  # and one of few bins
+
+
+def test_a_level_that_is_not_what_a_free_run_leaves_is_the_misfit_of_another_structure() -> None:
+    error = np.array([1.0, 1.0, 1.0, 1.0])
+    assert is_what_is_left(np.array([0.1, 0.9, 1.2, 60.0]), error, RULE).tolist() == [False, True, True, False]
+
+
+def test_resonances_of_a_wrong_structure_are_not_taken_for_noise() -> None:
+    rig = building(8, "bending", 3, 20.0)
+    state = begun(rig.system, rig, Options(), lambda share, what: None)
+    declared = declared_noise(state.system, state.prepared.signals).sensors
+    residual = np.abs(state.fit.spectrum[state.problem.part.grid.band.stop :])
+    assert np.max(np.sqrt(np.mean(residual**2, axis=0)) / declared) > 10  # the fitted model is far off there
+    ratio = upper_ratio(state, declared)  # a bound: some motion goes on above the band
+    assert np.all(ratio > 0.9) and np.all(ratio < 2)
+
+
+def test_a_floor_is_at_most_the_error_that_contains_it() -> None:
+    measured, errors = np.ones((2000, 3)), np.array([0.5, 1.01, 3.0])
+    run = FreeRun(measured, measured, errors, None)  # type: ignore[arg-type]  # the point is not read
+    assert realised_floor(np.ones(3), run).tolist() == [0.5, 1.01, 1.0]
