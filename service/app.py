@@ -34,6 +34,7 @@ from sprung.service.api.guard import Guard
 from sprung.service.api.head import HeadAsGet
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.queries import only_known_parameters
+from sprung.service.api.scopes import FORM, NEEDS
 from sprung.service.api.twice import no_key_twice
 from sprung.service.core import Core
 from sprung.service.pages import routes as fleet_page
@@ -47,6 +48,7 @@ DESCRIPTION = (
 )
 
 VALUE_BYTES = 40  # of one value of a window as JSON, generously: a minute of a vehicle without inputs is 1.5 MB
+WITH_SAMPLES = ("/identify", "/ingest/estimates")
 OTHER_BYTES = 1 << 17  # of bodies that hold no samples: their errors are found in milliseconds
 
 
@@ -124,8 +126,8 @@ def _guard(app: FastAPI, core: Core) -> None:
     app.add_middleware(
         BodyLimit,
         limit=min(windows, OTHER_BYTES),
-        paths={"/recordings": uploads, "/diagnose": uploads}
-        | dict.fromkeys(("/identify", "/ingest/estimates", "/ingest/windows"), windows),
+        paths={(path, FORM): uploads for path in ("/recordings", "/diagnose")}
+        | {(path, kind): windows for path in WITH_SAMPLES for kind in NEEDS["POST", path].body},
     )
     app.add_middleware(HeadAsGet)
     app.add_middleware(

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf
 from pathlib import Path
 from types import FrameType
@@ -25,7 +26,8 @@ from sprung.service.api.server import make_server
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.errors import UserError
-from sprung.service.jobs.recordings import file_row, finish_row, reading_limits
+from sprung.service.insisting import insist
+from sprung.service.jobs.recordings import add_row, file_row, finish_row, reading_limits
 from sprung.service.lock import held
 from sprung.service.monitoring.engine import load_engine
 from sprung.service.monitoring.numerics import numerics
@@ -34,7 +36,6 @@ from sprung.service.settings import Settings
 from sprung.service.sources.feed import FeedResult, OnBatch, feed_file, vehicle_of
 from sprung.service.sources.live import LiveFeed
 from sprung.service.store import open_store
-from sprung.service.store.work import add_recording
 
 log = logging.getLogger("sprung")
 
@@ -154,8 +155,7 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
         on_batch, on_end = watch(path, core)
         try:
             row = file_row(path)
-            with core.store.write() as connection:
-                add_recording(connection, row)
+            insist(partial(add_row, core.store, row), path.name, check)
             fed = feed_file(
                 core.pipeline,
                 path,
@@ -167,8 +167,9 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
                 on_batch=on_batch,
                 on_tally=core.tally_counter("file"),
                 check=check,
+                insistent=True,
             )
-            finish_row(core.store, row, fed)
+            insist(partial(finish_row, core.store, row, fed), path.name, check)
             on_end(fed)
         except Interrupted:
             return

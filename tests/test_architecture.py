@@ -54,6 +54,7 @@ BESIDE = {"diagnosis": _BELOW, "exchange": _BELOW, "alps": ORDER}
 # Inside `service` every name imports only names to its left
 SERVICE_ORDER = (
     "errors",
+    "insisting",
     "times",
     "settings",
     "durable",

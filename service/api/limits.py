@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sprung.service.api.problems import ApiProblem, problem_response
+from sprung.service.api.scopes import content_kind
 
-
-class BodyTooLarge(Exception):
-    """Raised out of `receive` when a body without a stated length passes the limit."""
+CLOSE = {"Connection": "close"}
 
 
 class BodyLimit:
-    """ASGI middleware: 413 for a body longer than its path's limit, stated in its header or not."""
+    """ASGI middleware: 413 for a body longer than its limit, stated in its header or not."""
 
-    def __init__(self, app: ASGIApp, limit: int, paths: Mapping[str, int]) -> None:
+    def __init__(self, app: ASGIApp, limit: int, paths: Mapping[tuple[str, str], int]) -> None:
+        """limit: bytes; paths: other ones, by path and type of body: what goes to the disk may be longer than what is
+        held in memory."""
         self.app = app
         self.limit = limit
         self.paths = paths
@@ -25,34 +28,21 @@ class BodyLimit:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        limit = self.paths.get(scope["path"], self.limit)
-        stated = dict(scope["headers"]).get(b"content-length", b"")
+        headers = Headers(scope=scope)
+        limit = self.paths.get((scope["path"], content_kind(headers)), self.limit)
+        detail = f"the body is longer than {limit} bytes"
+        stated = headers.get("content-length", "")
         if stated.isdigit() and int(stated) > limit:
-            await self._refuse(scope, receive, send, limit)
+            await problem_response(ApiProblem(413, detail, headers=CLOSE), scope["path"])(scope, receive, send)
             return
         received = 0
-        answered = False
 
         async def counted() -> Message:
             nonlocal received
             message = await receive()
             received += len(message.get("body", b""))
             if received > limit:
-                raise BodyTooLarge
+                raise HTTPException(413, detail, CLOSE)  # of any other kind, routes would make 400 without a reason
             return message
 
-        async def noted(message: Message) -> None:
-            nonlocal answered
-            answered = True
-            await send(message)
-
-        try:
-            await self.app(scope, counted, noted)
-        except BodyTooLarge:
-            if answered:
-                raise
-            await self._refuse(scope, receive, send, limit)
-
-    async def _refuse(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
-        problem = ApiProblem(413, f"the body is longer than {limit} bytes", headers={"Connection": "close"})
-        await problem_response(problem, scope["path"])(scope, receive, send)
+        await self.app(scope, counted, send)

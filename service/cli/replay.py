@@ -18,7 +18,7 @@ from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.progress import progress
 from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import CALLED, spooled
-from sprung.service.jobs.recordings import file_row, finish_row
+from sprung.service.jobs.recordings import add_row, file_row, finish_row
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import load_engine
 from sprung.service.monitoring.pipeline import Pipeline
@@ -34,7 +34,7 @@ from sprung.service.monitoring.views import (
 from sprung.service.monitoring.words import size_in_words
 from sprung.service.settings import Settings, settings_with
 from sprung.service.sources.feed import FeedResult, comfort_dict, feed_file
-from sprung.service.store import open_store, work
+from sprung.service.store import open_store
 from sprung.service.times import to_iso
 
 SLACK_SECONDS = 3.0  # to start
@@ -96,8 +96,7 @@ def _replay(pipeline: Pipeline, settings: Settings, options: ReplayOptions, name
 def _fed(pipeline: Pipeline, settings: Settings, options: ReplayOptions, path: Path, start: int | None) -> FeedResult:
     system, store = pipeline.engine.system, pipeline.store
     row = file_row(path, start)
-    with store.write() as connection:
-        work.add_recording(connection, row)
+    add_row(store, row)
     kept = Counter[str]()
     with (
         reporting_what_is_kept(kept, None if settings.store is None else store.engine.url),

@@ -13,7 +13,8 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.model.system import System
-from sprung.service.diagnosis.worker import load_excerpt, save_excerpt
+from sprung.service.diagnosis.excerpts import kept_excerpt
+from sprung.service.diagnosis.worker import load_excerpt
 from sprung.service.monitoring.processed import Batch
 from sprung.service.monitoring.ring import Excerpt, Rings
 from sprung.service.settings import Settings
@@ -67,19 +68,18 @@ class AlarmSignals:
         if excerpt is None:
             return
         stretch = held(excerpt)
-        name = f"{work.new_id()}.npz"
-        path = self._settings.uploads / name
-        save_excerpt(path, excerpt)
         label = f"{(stretch.end - stretch.start) / NANOSECONDS:.0f} s until {to_iso(stretch.end)} of {vehicle}"
         about = {"start_ns": stretch.start, "end_ns": stretch.end, "channels": _channels(system)}
         now = now_ns()
-        row = RecordingRow(work.new_id(), vehicle, label, ALARM_SOURCE, name, path.stat().st_size, about, now, now)
-        with self._store.write() as connection:
-            files = [name]
-            if fleet.vehicle_exists(connection, vehicle):  # it may have been deleted meanwhile
-                work.add_recording(connection, row)
-                limits = self._settings.alarm_signals_vehicle, self._settings.alarm_signals_bytes
-                files = retention.surplus_alarm_signals(connection, vehicle, *limits)
+        with kept_excerpt(self._settings.uploads, excerpt) as path:
+            size = path.stat().st_size
+            row = RecordingRow(work.new_id(), vehicle, label, ALARM_SOURCE, path.name, size, about, now, now)
+            with self._store.write() as connection:
+                files = [path.name]
+                if fleet.vehicle_exists(connection, vehicle):  # it may have been deleted meanwhile
+                    work.add_recording(connection, row)
+                    limits = self._settings.alarm_signals_vehicle, self._settings.alarm_signals_bytes
+                    files = retention.surplus_alarm_signals(connection, vehicle, *limits)
         for file in files:
             (self._settings.uploads / file).unlink(missing_ok=True)
 

@@ -11,10 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection
+from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.model.system import MANCHESTER
+from sprung.model.text import first_line
+from sprung.service.diagnosis.excerpts import kept_excerpt
 from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Stage
-from sprung.service.diagnosis.worker import run, save_excerpt
+from sprung.service.diagnosis.worker import run
 from sprung.service.durable import sync_folder, sync_tree
 from sprung.service.errors import Busy, UserError
 from sprung.service.jobs.queue import Jobs, Progress
@@ -55,16 +58,21 @@ class Diagnoses:
         if (now - since) / NANOSECONDS < self._settings.misfit_seconds:
             return
         with self._lock:
-            if now < self._next.get(batch.vehicle, 0) or self._runs(self._started.get(batch.vehicle)):
+            if now < self._next.get(batch.vehicle, 0):
                 return
             self._next[batch.vehicle] = now + round(self._settings.misfit_pause_seconds * NANOSECONDS)
+            before = self._started.get(batch.vehicle)
+        job = None
         try:
-            job = self.from_excerpt(batch.vehicle)
-        except (Busy, UserError, OSError):
-            with self._lock:  # tried again with the next window
-                self._next.pop(batch.vehicle, None)
-        else:
-            with self._lock:
+            job = None if self._runs(before) else self.from_excerpt(batch.vehicle)
+        except (Busy, UserError):
+            pass
+        except (OSError, SQLAlchemyError) as error:  # the windows are stored, whatever comes of this
+            log.warning("a diagnosis of %s cannot be begun yet: %s", batch.vehicle, first_line(error))
+        with self._lock:
+            if job is None:
+                self._next.pop(batch.vehicle, None)  # tried again with the next window
+            else:
                 self._started[batch.vehicle] = job.id
 
     def excerpt(self, vehicle: str) -> Excerpt | None:
@@ -77,12 +85,11 @@ class Diagnoses:
         if excerpt is None:
             raise UserError(f"no recent samples of {vehicle} are held; upload a recording instead")
         self._jobs.reserve()
-        name = f"{work.new_id()}.npz"
-        save_excerpt(self._settings.uploads / name, excerpt)
-        size = (self._settings.uploads / name).stat().st_size
         label = f"last {len(excerpt.values) / excerpt.sample_rate:.0f} s of {vehicle}"
-        row = RecordingRow(work.new_id(), vehicle, label, "excerpt", name, size, None, now_ns(), None)
-        return self._jobs.submit("diagnosis", row, vehicle)
+        with kept_excerpt(self._settings.uploads, excerpt) as path:
+            size = path.stat().st_size
+            row = RecordingRow(work.new_id(), vehicle, label, "excerpt", path.name, size, None, now_ns(), None)
+            return self._jobs.submit("diagnosis", row, vehicle)
 
     def from_recording(self, row: RecordingRow, vehicle: str | None) -> JobRow:
         """Accept a diagnosis of a recording in the upload folder."""
@@ -125,15 +132,19 @@ class DiagnosisJobs:
             served = self._engines.shared if vehicle is None else self._engines.of(connection, vehicle)
             text = None if vehicle is None else vehicle_models.text_of(connection, vehicle, served.version)
         found = self._diagnose(path, row, report_id, progress, served, text)
-        with self._store.write() as connection:
-            if vehicle is not None:
-                fleet.ensure_vehicle(connection, vehicle, now_ns())
-            if work.get_report(connection, report_id) is None:
-                report = ReportRow(report_id, vehicle, row.id, found.verdict, found.report, now_ns())
-                work.add_report(connection, report)
-                self._on_report(connection, vehicle, report_id, found.report)
-            if vehicle is not None and row.source == "excerpt":
-                fleet.attach_report(connection, vehicle, served.model_id, report_id)
+
+        def keep() -> None:
+            with self._store.write() as connection:
+                if vehicle is not None:
+                    fleet.ensure_vehicle(connection, vehicle, now_ns())
+                if work.get_report(connection, report_id) is None:
+                    report = ReportRow(report_id, vehicle, row.id, found.verdict, found.report, now_ns())
+                    work.add_report(connection, report)
+                    self._on_report(connection, vehicle, report_id, found.report)
+                if vehicle is not None and row.source == "excerpt":
+                    fleet.attach_report(connection, vehicle, served.model_id, report_id)
+
+        progress.insist(keep)  # rather than search once more
         return {"report": report_id, "verdict": found.verdict}
 
     def _diagnose(

@@ -89,10 +89,13 @@ def save_excerpt(path: Path, excerpt: Excerpt) -> None:
     """Write samples as an .npz that `load_excerpt` reads; whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.part")
-    with open(part, "wb") as target:
-        np.savez_compressed(target, start=excerpt.start, sample_rate=excerpt.sample_rate, values=excerpt.values)
-    sync_file(part)
-    part.replace(path)
+    try:
+        with open(part, "wb") as target:
+            np.savez_compressed(target, start=excerpt.start, sample_rate=excerpt.sample_rate, values=excerpt.values)
+        sync_file(part)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)  # of a disk that is full
     sync_folder(path.parent)
 
 

@@ -2,7 +2,8 @@
 
 What was accepted survives: a job that a stop interrupts is queued again and goes on at the next start (windows are
 stored once, so doing a part twice changes nothing).  A job that was at work when its process died is tried once more,
-and then failed: a recording must not take the service down at every start.
+and then failed: a recording must not take the service down at every start.  One that the store or the disk refuses goes
+on when they take things again.
 """
 
 from __future__ import annotations
@@ -13,17 +14,19 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import Busy, NotFound, UserError
+from sprung.service.insisting import insist, told
 from sprung.service.observability.queues import WaitMetrics
 from sprung.service.store import Store, work
 from sprung.service.times import NANOSECONDS, now_ns
 
 log = logging.getLogger("sprung.jobs")
+T = TypeVar("T")
 WORST_MESSAGE = "an unexpected error; the service's log has the details"
 MOST_ATTEMPTS = 2
 PROGRESS_SECONDS = 1.0  # between two notes of progress in the store
@@ -51,6 +54,7 @@ class Progress:
         self._noted = -PROGRESS_SECONDS
         self._shown = 0.0
         self._reached = 0.0
+        self._trouble = ""  # why work was refused last
 
     def cancel(self) -> None:
         """Make the next `check` raise."""
@@ -63,11 +67,26 @@ class Progress:
         if self._cancelled.is_set():
             raise Cancelled
         if time.monotonic() > self._deadline:
-            raise UserError(f"the job took longer than {self._seconds:.0f} s")
+            last = f"; last: {self._trouble}" if self._trouble else ""
+            raise UserError(f"the job took longer than {self._seconds:.0f} s{last}")
         now = time.monotonic()
         if self._reached >= self._shown + 0.01 and now - self._noted >= PROGRESS_SECONDS:
             self._shown, self._noted = self._reached, now
             self._note(self._shown)
+
+    def insist(self, work: Callable[[], T]) -> T:
+        """What `work` returns, tried again while the store or the machine refuses it and the job has time."""
+
+        def noted() -> T:
+            try:
+                found = work()
+            except Exception as error:
+                self._trouble = told(error)
+                raise
+            self._trouble = ""
+            return found
+
+        return insist(noted, "a job", self.check)
 
     def step(self, share: float) -> None:
         """`share` of the work is done, 0..1; it is noted now or, when the last note is young, by a later check."""
@@ -228,7 +247,9 @@ class Jobs:
         try:
             if kind is None:
                 raise UserError(f"jobs of kind {job.kind!r} are not known to this version")
-            return {"state": "done", "progress": 1.0, "result": kind.run(job, progress), "attempts": job.attempts}
+            run = kind.run
+            result = progress.insist(lambda: run(job, progress))
+            return {"state": "done", "progress": 1.0, "result": result, "attempts": job.attempts}
         except ServiceStopped:
             return {"state": "queued", "attempts": job.attempts}  # an end in good order is no attempt
         except Cancelled:

@@ -49,10 +49,11 @@ class RecordingJobs:
                 on_tally=self._counter(),
                 check=progress.check,
                 start=row.began_ns,
+                insistent=True,
             )
         except (UnreadableRecording, UserError) as error:
             raise UserError(str(error).replace(str(path), row.name)) from error
-        finish_row(self._pipeline.store, row, fed)
+        progress.insist(lambda: finish_row(self._pipeline.store, row, fed))
         return {"recording": row.id} | fed.summary()
 
 
@@ -81,6 +82,12 @@ def file_row(path: Path, began: int | None = None) -> work.RecordingRow:
     return work.RecordingRow(
         work.new_id(), None, path.name[:255], "file", None, path.stat().st_size, None, now_ns(), None, began
     )
+
+
+def add_row(store: Store, row: work.RecordingRow) -> None:
+    """Write down that a file is going to be read."""
+    with store.write() as connection:
+        work.add_recording(connection, row)
 
 
 def finish_row(store: Store, row: work.RecordingRow, fed: FeedResult) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import sys
 from contextvars import ContextVar
 from datetime import UTC, datetime
@@ -13,6 +14,7 @@ from sprung.model.text import escaped
 
 request_id: ContextVar[str] = ContextVar("request_id", default="")
 PLAIN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime"}
+WORD = re.compile(r"[^\s\"=]+")
 
 
 class JsonLines(logging.Formatter):
@@ -26,9 +28,7 @@ class JsonLines(logging.Formatter):
             "logger": record.name,
             "event": record.getMessage(),
         }
-        if request_id.get():
-            line["request"] = request_id.get()
-        line |= {name: value for name, value in vars(record).items() if name not in PLAIN}
+        line |= _beside(record)
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, default=str)
@@ -38,9 +38,24 @@ class PlainLines(logging.Formatter):
     """Text for people; an event stays on its line, however many its message has (SQL errors have three)."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """Level and message."""
+        """Level and message, then what was given as `extra`, and the request."""
         line = " ".join(f"sprung: {record.levelname}: {record.message}".splitlines())
+        line += "".join(f" {name}={_plain(value)}" for name, value in _beside(record).items())
         return escaped(line)  # a terminal would obey them
+
+
+def _beside(record: logging.LogRecord) -> dict[str, Any]:
+    """The request that an event belongs to, and what was given as `extra`."""
+    request = {"request": request_id.get()} if request_id.get() else {}
+    return request | {name: value for name, value in vars(record).items() if name not in PLAIN}
+
+
+def _plain(value: Any) -> str:
+    """A value of a line of text; between quotation marks where it could be taken for more than one."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    text = str(value)
+    return text if WORD.fullmatch(text) else json.dumps(text)
 
 
 TOLD = "sprung_told"  # attribute of an exception that is in the log already

@@ -12,10 +12,11 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from sprung.model import comfort
-from sprung.model.signals import Tally
+from sprung.model.signals import Tally, Window
 from sprung.model.text import IN_VEHICLE_IDS
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.errors import UserError
+from sprung.service.insisting import Insist, insist
 from sprung.service.monitoring import rides
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.pipeline import Pipeline
@@ -104,6 +105,7 @@ def feed_file(
     on_tally: OnTally = lambda tally: None,
     check: Callable[[], None] = lambda: None,
     start: int | None = None,
+    insistent: bool = False,
 ) -> FeedResult:
     """Read a recording to its end, through the pipeline.
 
@@ -111,12 +113,14 @@ def feed_file(
     speed: times real time; 0: as fast as possible.  limits: read in a process of its own, within these.
     start: ns since 1970, when the recording began if its times count from 0; else the file's own time is taken.
     check: called while waiting; this stops with whatever it or `on_batch` raises, batches before are stored.
+    insistent: a store that refuses a batch is asked again until it takes it, or `check` raises.
     Raises UnreadableRecording, or UserError where the limits are exceeded.
     """
     request = ReadRequest(
         path, pipeline.engine.system, pipeline.engine.dbc, 1 if speed else batch_windows, speed, start
     )
     reading = reading_of(request, limits)
+    take: Insist[Any] = partial(insist, what=file_name or path.name, check=check) if insistent else _at_once
     started = time.perf_counter()
     fed = FeedResult("", ride=comfort.RideQuality(pipeline.engine.system))
 
@@ -126,7 +130,7 @@ def feed_file(
     priority = Priority.LIVE if speed else Priority.BATCH
 
     def refuse(piece: ReadWindows) -> None:
-        other = _other_ride(pipeline, fed.vehicle, piece, recording_id)
+        other = take(partial(_other_ride, pipeline, fed.vehicle, piece, recording_id))
         if other is not None:
             raise UserError(
                 f"{path}: its times count from 0, and from {to_iso(piece.windows[0].start)} on, as the file's own time "
@@ -134,18 +138,22 @@ def feed_file(
                 "`start` beside an uploaded file)"
             )
 
-    found = prefetched(_identified(pipeline, fed, reading, name, priority, check, refuse), 1, check)
+    def identify(windows: list[Window]) -> IdentifiedBatch:
+        identified: IdentifiedBatch = take(partial(pipeline.identify, fed.vehicle, windows, priority))
+        return identified
+
+    found = prefetched(_identified(pipeline, fed, reading, name, identify, check, refuse), 1, check)
     try:
         for one, tally in found:
             on_tally(tally)
             if one is not None:
-                on_batch(_count(fed, pipeline.keep(one(), recording_id)))
+                on_batch(_count(fed, take(partial(pipeline.keep, one(), recording_id))))
     finally:
         reading.close()
         found.close()
     on_tally(reading.ending.tally)
     fed.vehicle = name(reading.ending.vehicle)
-    fed.state = fed.state or pipeline.state(fed.vehicle)
+    fed.state = fed.state or take(partial(pipeline.state, fed.vehicle))
     _ended(fed, reading.ending)
     fed.wall_seconds = time.perf_counter() - started
     return fed
@@ -156,7 +164,7 @@ def _identified(
     fed: FeedResult,
     reading: Reading,
     name: Callable[[str | None], str],
-    priority: Priority,
+    identify: Callable[[list[Window]], IdentifiedBatch],
     check: Callable[[], None],
     refuse: Callable[[ReadWindows], None],
 ) -> Iterator[tuple[Callable[[], IdentifiedBatch] | None, Tally]]:
@@ -171,7 +179,7 @@ def _identified(
             for window in piece.windows:
                 if window.outcome != "dropped" and fed.ride is not None:
                     fed.ride.push(window.start, window.values)
-            found = partial(pipeline.identify, fed.vehicle, piece.windows, priority)
+            found = partial(identify, piece.windows)
             if not pipeline.knows_faults(fed.vehicle):
                 found = partial(_itself, found())
         yield found, piece.tally
@@ -189,6 +197,10 @@ def _other_ride(pipeline: Pipeline, vehicle: str, piece: ReadWindows, recording_
         own = None if recording_id is None else work.get_recording(connection, recording_id)
     others = [row.name for row in stored if own is None or (row.name, row.size_bytes) != (own.name, own.size_bytes)]
     return others[0] if others else None
+
+
+def _at_once(work: Callable[[], Any]) -> Any:
+    return work()
 
 
 def _itself(found: IdentifiedBatch) -> IdentifiedBatch:

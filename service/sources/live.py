@@ -16,12 +16,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from sqlalchemy.exc import SQLAlchemyError
-
 from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.model.text import first_line
 from sprung.replay.auxiliary import AuxiliaryMeans
-from sprung.service.errors import NO_THREAD, Busy
+from sprung.service.insisting import FIRST_RETRY, LAST_RETRY, passes
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.engine import Engine
 from sprung.service.sources.feed import OnTally
@@ -31,14 +29,12 @@ log = logging.getLogger("sprung.live")
 
 WAITING_WINDOWS = 240  # two minutes at two windows a second, 22 kB each
 TOGETHER = 32  # windows that are stored in one transaction when some wait
-FIRST_RETRY, LAST_RETRY = 0.5, 30.0  # s, doubled from try to try
 SILENT_SECONDS = 10.0  # without a sample from an open bus
 HUNG_SECONDS = 30.0  # without a sign of the reader; it looks at the bus twenty times a second
 WATCH_SECONDS = 1.0
 BEHIND_SECONDS = 5.0
 LATELY_SECONDS = 30.0  # for which windows that were given up show in the state
 FAILING_WINDOWS = 10  # in a row that the numerics could not take: no longer single ones
-PASSING = (SQLAlchemyError, OSError, Busy, MemoryError)  # what goes away by itself: the same windows are tried again
 
 
 class Source(Protocol):
@@ -240,7 +236,7 @@ class LiveFeed:
                 self._refused, self._failed_in_a_row = "", 0
                 return
             except Exception as error:
-                if not _passes(error):
+                if not passes(error):
                     self._leave_out(windows, error)
                     return
                 if not self._refused:
@@ -286,7 +282,3 @@ class LiveFeed:
         self.source.beat = self._begun
         self._reading = self._thread(self._read)
         self._reading.start()
-
-
-def _passes(error: Exception) -> bool:
-    return isinstance(error, PASSING) or str(error) == NO_THREAD

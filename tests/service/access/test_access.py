@@ -503,6 +503,17 @@ def test_logs_are_one_json_object_a_line_with_the_request() -> None:
     assert (line["event"], line["level"], line["job"], line["request"]) == ("job ended", "info", "j1", "ride-7")
 
 
+def test_a_line_of_text_has_what_a_line_of_json_has() -> None:
+    record = logging.makeLogRecord({"name": "sprung.x", "levelno": 20, "levelname": "INFO", "msg": "request"})
+    record.path, record.status, record.seconds = '/a b="c"', 200, 0.12345
+    token = request_id.set("ride-7")
+    try:
+        line = PlainLines().format(record)
+    finally:
+        request_id.reset(token)
+    assert line == r'sprung: INFO: request request=ride-7 path="/a b=\"c\"" status=200 seconds=0.1235'
+
+
 def test_an_unexpected_error_is_in_the_log_once() -> None:
     """The server reports again what the application has reported."""
     error = RuntimeError("x")

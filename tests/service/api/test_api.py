@@ -206,6 +206,20 @@ def test_a_body_past_the_limit_is_refused_stated_or_not(client: TestClient) -> N
     refused(client.post("/identify", content=endless(), headers=JSON), 413)
 
 
+@pytest.mark.parametrize("path", ["/vehicles/a/notes", "/tokens", "/diagnose"])
+def test_a_body_that_is_held_in_memory_has_the_limit_of_those_wherever_it_is_sent(
+    client: TestClient, path: str
+) -> None:
+    """Uploads, which `/diagnose` takes as well, may be longer because they go to the disk as they come."""
+
+    def endless() -> Iterator[bytes]:
+        for _ in range(40):
+            yield b" " * 10_000
+
+    refused(client.post(path, content=b" " * 200_000, headers=JSON), 413)
+    refused(client.post(path, content=endless(), headers=JSON), 413)
+
+
 def test_unknown_paths_methods_and_vehicles_are_problems(client: TestClient) -> None:
     refused(client.get("/nothing"), 404)
     refused(client.delete("/vehicles"), 405)

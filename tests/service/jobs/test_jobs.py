@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 import time
 from dataclasses import replace
@@ -149,6 +150,51 @@ def test_a_store_that_refuses_the_end_of_a_job_is_asked_again(store: Store, monk
     eventually(lambda: stored(store, job.id).state == "done")
     assert refusals == 0
     jobs.close()
+
+
+@pytest.mark.parametrize(
+    "trouble",
+    [
+        OperationalError("SELECT", {}, Exception("database is locked")),
+        OSError(errno.ENOSPC, "No space left on device"),
+        OSError(errno.EMFILE, "Too many open files"),
+        MemoryError(),
+    ],
+)
+def test_a_job_that_the_machine_refuses_for_a_while_is_done(
+    store: Store, monkeypatch: pytest.MonkeyPatch, trouble: Exception
+) -> None:
+    monkeypatch.setattr("sprung.service.insisting.FIRST_RETRY", 0.01)
+    troubles = [trouble] * 3
+
+    def refused(_job: JobRow, _progress: Progress) -> dict[str, Any]:
+        if troubles:
+            raise troubles.pop()
+        return {"done": True}
+
+    jobs = Jobs(store, {"toy": Kind(refused, 60)}, 4)
+    jobs.start()
+    job = jobs.submit("toy")
+    eventually(lambda: stored(store, job.id).state not in work.UNFINISHED)
+    jobs.close()
+    assert (stored(store, job.id).state, stored(store, job.id).result) == ("done", {"done": True})
+
+
+def test_a_job_that_is_refused_for_good_ends_with_its_time_when_it_is_cancelled_and_with_the_service(
+    store: Store,
+) -> None:
+    def refused(_job: JobRow, _progress: Progress) -> dict[str, Any]:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    jobs = Jobs(store, {"short": Kind(refused, 0.2), "long": Kind(refused, 60)}, 4)
+    jobs.start()
+    short, cancelled, last = jobs.submit("short"), jobs.submit("long"), jobs.submit("long")
+    eventually(lambda: stored(store, short.id).state == "failed")
+    assert stored(store, short.id).error == "the job took longer than 0 s; last: Read-only file system"
+    jobs.cancel(cancelled.id, "anna")
+    eventually(lambda: stored(store, last.id).state == "running")
+    jobs.close()
+    assert [stored(store, job.id).state for job in (cancelled, last)] == ["failed", "queued"]
 
 
 def test_an_unknown_kind_is_failed_not_fatal(store: Store) -> None:

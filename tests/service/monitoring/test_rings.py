@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
+from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import System
+from sprung.service.diagnosis.excerpts import kept_excerpt
 from sprung.service.diagnosis.worker import load_excerpt, save_excerpt
 from sprung.service.monitoring.ring import Excerpt, Ring, Rings
 from tests.service_fakes import HOP, START, make_window
@@ -58,3 +61,13 @@ def test_an_excerpt_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     record = load_excerpt(tmp_path / "new" / "x.npz")
     np.testing.assert_array_equal(record.values, values)
     assert (record.start, record.sample_rate, record.lost) == (START, 100.0, 2)
+
+
+def test_samples_that_the_store_does_not_take_are_not_left_behind(tmp_path: Path) -> None:
+    excerpt = Excerpt(START, 100.0, np.zeros((5, 2)))
+    with pytest.raises(OperationalError), kept_excerpt(tmp_path, excerpt):
+        raise OperationalError("INSERT", {}, Exception("database is locked"))
+    assert list(tmp_path.iterdir()) == []
+    with kept_excerpt(tmp_path, excerpt) as path:
+        pass
+    assert list(tmp_path.iterdir()) == [path]

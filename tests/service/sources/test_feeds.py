@@ -16,6 +16,7 @@ import cantools
 import pytest
 from cantools.database.can import Database
 from fastapi.testclient import TestClient
+from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, parse_system
 from sprung.model.tracking.tracker import Tracker
@@ -23,7 +24,7 @@ from sprung.replay.live import LiveBus
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.errors import UserError
-from sprung.service.main import Feeds, _limits, live_feed
+from sprung.service.main import Feeds, _feed_files, _limits, live_feed
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine, make_tracker
 from sprung.service.monitoring.pipeline import Pipeline
@@ -126,6 +127,38 @@ def test_an_upload_becomes_a_job_and_its_windows_are_stored(
 def test_the_same_upload_twice_stores_nothing_twice(client: TestClient, recording: Path) -> None:
     for _ in range(2):
         finished(client, upload(client, recording, vehicle="bus-7").json())
+    assert client.get("/vehicles/bus-7").json()["windows"]["used"] == 9
+
+
+@pytest.mark.parametrize("how", ["upload", "replay"])
+def test_a_store_that_refuses_for_a_while_costs_no_recording(
+    client: TestClient, core: Core, recording: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    monkeypatch.setattr("sprung.service.insisting.FIRST_RETRY", 0.01)
+    refusals = {"keep": 3, "identify": 2, "state": 1}
+
+    def refusing(name: str) -> Any:
+        real = getattr(core.pipeline, name)
+
+        def asked(*given: Any) -> Any:
+            if refusals[name]:
+                refusals[name] -= 1
+                raise OperationalError("INSERT", {}, Exception("database is locked"))
+            return real(*given)
+
+        return asked
+
+    for name in refusals:
+        monkeypatch.setattr(core.pipeline, name, refusing(name))
+    if how == "upload":
+        assert finished(client, upload(client, recording, vehicle="bus-7").json())["result"]["windows"]["used"] == 9
+    else:
+        monkeypatch.setattr("sprung.service.main._limits", lambda *_: None)
+        ended = threading.Event()
+        feeds = Feeds((recording,), vehicle="bus-7")
+        _feed_files(core, feeds, lambda path, core: (lambda batch: None, lambda fed: ended.set()))
+        assert ended.is_set()
+    assert refusals["keep"] == refusals["identify"] == 0
     assert client.get("/vehicles/bus-7").json()["windows"]["used"] == 9
 
 
