@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
+from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.api.access import CoreOf
 from sprung.service.api.actors import ClientOf
@@ -19,6 +21,7 @@ from sprung.service.times import optional_iso
 router = APIRouter(tags=["vehicles"])
 LEAST_SECONDS = 1.0  # between two answers: a page that redraws more often is not read better
 BEAT_SECONDS = 15.0  # a comment, so that proxies keep the connection
+ASK_SECONDS = 5.0  # between two looks whether whoever follows still may
 
 
 @router.get(
@@ -32,6 +35,7 @@ async def events(
 ) -> Response:
     """Server-sent events `vehicle` with `{"vehicle", "window", "alarms"}`, at most one a second and vehicle.
 
+    It ends when the token or session that it was begun with does.
     A client may follow 40 times at once (429). Of 200 in all, the client with most streams loses its oldest to others.
     """
     loop, ready = asyncio.get_running_loop(), asyncio.Event()
@@ -45,10 +49,14 @@ async def events(
 
 
 async def _stream(request: Request, core: Core, listener: Listener, ready: asyncio.Event) -> AsyncIterator[str]:
-    quiet = 0.0
+    quiet, asked = 0.0, time.monotonic()
     try:
         yield "retry: 3000\n\n"
         while not (core.stopping.is_set() or listener.ended) and not await request.is_disconnected():
+            if time.monotonic() - asked > ASK_SECONDS:
+                if not await _still_let_in(request):
+                    return
+                asked = time.monotonic()
             try:
                 await asyncio.wait_for(ready.wait(), LEAST_SECONDS)
             except TimeoutError:
@@ -65,3 +73,12 @@ async def _stream(request: Request, core: Core, listener: Listener, ready: async
             await asyncio.sleep(LEAST_SECONDS)
     finally:
         core.hub.leave(listener)
+
+
+async def _still_let_in(request: Request) -> bool:
+    """Whether the guard would let the request in now; a store that cannot be asked ends nobody's stream."""
+    try:
+        allowed: bool = await request.scope["sprung.again"]()
+    except (SQLAlchemyError, OSError, MemoryError):
+        return True
+    return allowed

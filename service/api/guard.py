@@ -9,7 +9,7 @@ import random
 import re
 import time
 from collections.abc import Callable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import quote, urlsplit
 
@@ -149,6 +149,7 @@ class Guard:
             await response(scope, receive, with_headers)
             return
         scope["sprung.actor"] = actor
+        scope["sprung.again"] = partial(self._again, headers, need, path)
         signed_in.set(actor.name if by_cookie and actor not in (LOCAL, NOBODY) else "")
         await self.app(scope, receive, with_headers)
 
@@ -187,6 +188,17 @@ class Guard:
         self._good[credential] = True
         self._limiter.take(f"token {actor.key}")
         return actor, by_cookie
+
+    async def _again(self, headers: Headers, need: RequiredScope, path: str) -> bool:
+        """Whether a request that is still being answered would be let in now: its token may have been revoked since."""
+        try:
+            found = await self._foreign(headers)
+            if found is None:
+                found = await run_in_threadpool(self._actor, headers, time.perf_counter())
+            self._check_scope(found[0], need, path)
+        except ApiProblem as problem:
+            return problem.status >= 500  # nobody can be asked at the moment
+        return True
 
     async def _foreign(self, headers: Headers) -> tuple[Actor, bool] | None:
         """Whose token of the provider it is; None where it is none.  Off the event loop: keys may have to be asked

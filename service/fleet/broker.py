@@ -13,11 +13,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from sqlalchemy.exc import SQLAlchemyError
-
-from sprung.service.errors import Busy, UserError
+from sprung.service.errors import UserError
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.message import Message, read_messages
+from sprung.service.insisting import passes
 
 log = logging.getLogger("sprung.broker")
 TOGETHER = 64  # messages of one transaction
@@ -121,8 +120,13 @@ async def _store(messages: Sequence[Message], ingest: Ingest) -> list[Verdict]:
             return [verdict for one in messages for verdict in await _store([one], ingest)]
         log.error("a message is left out: %s", error)
         return ["refused"]
-    except (SQLAlchemyError, OSError, Busy) as error:
-        log.warning("the store does not take anything (%s); the messages come again", type(error).__name__)
-        await asyncio.sleep(AGAIN_SECONDS)
-        return ["again"] * len(messages)
+    except Exception as error:
+        if passes(error):
+            log.warning("the store does not take anything (%s); the messages come again", type(error).__name__)
+            await asyncio.sleep(AGAIN_SECONDS)
+            return ["again"] * len(messages)
+        if len(messages) > 1:
+            return [verdict for one in messages for verdict in await _store([one], ingest)]
+        log.exception("a message is left out")  # delivered again it would end every consumer that it reaches
+        return ["refused"]
     return ["stored"] * len(messages)

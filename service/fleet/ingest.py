@@ -12,12 +12,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import IngestResult, Message, OtherModel, WindowEstimate, decode, encode
+from sprung.service.fleet.plausible import impossible
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import FoldedWindows, HeldVehicle, WindowsToFold
@@ -49,7 +49,8 @@ class Ingest:
     def take(self, messages: Sequence[Message]) -> list[IngestResult]:
         """Fold messages of any vehicles in one transaction; they are stored when this returns.
 
-        Raises UserError for a message that cannot be folded, before anything is stored.
+        A window with numbers that cannot be is dropped, with the reason.  Raises UserError for a message that cannot
+        be folded, before anything is stored.
         """
         now = self._clock()
         for message in messages:
@@ -59,10 +60,9 @@ class Ingest:
         folded: list[FoldedWindows] = []
         with self._pipeline.store.write() as connection:
             held = self._pipeline.hold_all(connection, {message.vehicle for message in messages})
-            for message in messages:
-                _check(message, held[message.vehicle].served.engine)
+            sound = [_sound(message, held[message.vehicle].served.engine) for message in messages]
             for turn in _turns(messages):
-                asked = [messages[i] for i in turn]
+                asked = [sound[i] for i in turn]
                 done = self._fold_due(connection, asked, held, now)
                 for i, message, (one, changed) in zip(turn, asked, done, strict=True):
                     taken[i] = one
@@ -98,12 +98,20 @@ class Ingest:
             overdue = pending.overdue(connection, models, now - self._late, now + AHEAD)
         count = 0
         for vehicle in overdue:
-            with self._pipeline.store.write() as connection:
-                held = self._pipeline.hold_all(connection, [vehicle])
-                [(taken, folded)] = self._fold_due(connection, [Message(vehicle, "", ())], held, now)
-            count += taken.folded
-            self._settle([] if folded is None else [folded])
+            try:
+                count += self._fold_waiting(vehicle, now)
+            except (SQLAlchemyError, OSError):
+                raise
+            except Exception:  # the others have their turn all the same
+                log.exception("windows of %s that wait could not be folded; trying again", vehicle)
         return count
+
+    def _fold_waiting(self, vehicle: str, now: int) -> int:
+        with self._pipeline.store.write() as connection:
+            held = self._pipeline.hold_all(connection, [vehicle])
+            [(taken, folded)] = self._fold_due(connection, [Message(vehicle, "", ())], held, now)
+        self._settle([] if folded is None else [folded])
+        return taken.folded
 
     def _settle(self, folded: Sequence[FoldedWindows]) -> None:
         for one in folded:
@@ -138,7 +146,8 @@ class Ingest:
         starts = {row.start for row in waited} | {w.start for w in message.windows}
         older = [start for start in starts if start <= last]
         known = known_starts(connection, vehicle, model, older) if older else set()
-        fresh = [w for w in message.windows if w.start not in known]
+        first = {w.start: w for w in reversed(message.windows)}  # of several of one start the first counts
+        fresh = [w for w in first.values() if w.start not in known][::-1]
         held = {row.start: row for row in waited if row.start not in known}
         came = {w.start: w for w in fresh if w.start not in held}
         stepped_back = next((i for i, w in enumerate(fresh) if w.new_segment and w.start <= last), None)
@@ -199,7 +208,8 @@ def _check_times(message: Message, now: int) -> None:
             raise UserError(f"window {to_iso(window.start)}: before the year 2000 or in the future")
 
 
-def _check(message: Message, engine: Engine) -> None:
+def _sound(message: Message, engine: Engine) -> Message:
+    """A message whose windows have the model's shape, without numbers that cannot be."""
     _same_model(message, engine)
     P, S, H = len(engine.system.tracked), len(engine.system.sensors), len(engine.tracker.deviations)
     beside = len(engine.system.auxiliary)
@@ -212,10 +222,22 @@ def _check(message: Message, engine: Engine) -> None:
         if e.log_ratio.shape != (P,) or e.per_sensor.shape != (S,):
             raise UserError(f"an estimate of {e.log_ratio.size} parameters and {e.per_sensor.size} sensors came")
         d = e.deviating
-        if d is not None and (d.cross.shape != (P, H) or d.information.shape != (H, H) or d.point.shape != (H,)):
+        if e.covariance.shape != (P, P) or e.identifiable.shape != (P,):
+            raise UserError(f"an estimate with a covariance of shape {e.covariance.shape} came")
+        if d is not None and d.given.shape != (P, P):
+            raise UserError(f"deviations with a covariance of shape {d.given.shape} came")
+        if d is not None and (
+            d.score.shape != (H,) or d.cross.shape != (P, H) or d.information.shape != (H, H) or d.point.shape != (H,)
+        ):
             raise UserError(f"an estimate of {d.point.size} deviations came; the model has {H}")
-        if not (np.isfinite(e.log_ratio).all() and np.isfinite(e.covariance).all() and np.isfinite(e.chi_square)):
-            raise UserError(f"window {to_iso(window.start)}: numbers that are not finite")
+    return replace(message, windows=tuple(_plausible(window, engine) for window in message.windows))
+
+
+def _plausible(window: WindowEstimate, engine: Engine) -> WindowEstimate:
+    wrong = impossible(window, engine.system)
+    if wrong is None:
+        return window
+    return WindowEstimate(window.start, "dropped", f"its estimate came with {wrong}", 0, window.new_segment, None)
 
 
 def _same_model(message: Message, engine: Engine) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Protocol
 from urllib.parse import urlsplit
 
+from sprung.model.text import first_line
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import MEDIA_TYPE
 from sprung.service.fleet.spool import Spool, SpoolEntry
@@ -167,25 +168,36 @@ class Sending:
     def _run(self) -> None:
         pause = self._first_pause
         while not self._stopping.is_set():
-            entry = self._spool.first()
-            if entry is None:
+            try:
+                answer = self._one()
+            except Exception as error:  # the thread must outlive a disk that is full, and whatever a link comes to
+                answer = Answer(False, trouble=first_line(error) or type(error).__name__)
+            if answer is None:
                 self._wake.wait(1.0)
                 self._wake.clear()
                 continue
-            answer = self._link.send(entry)
-            if answer.stored or answer.refused:
-                if answer.refused:
-                    log.error("the server will not take %s: %s", entry.name or entry.kind, answer.refused)
-                self.sent += answer.stored
-                self.refused += not answer.stored
+            if not answer.trouble:
                 self.trouble, pause = "", self._first_pause
-                self._spool.done(entry)
                 continue
             if not self.trouble:
-                log.warning("the server accepts nothing (%s); messages wait", answer.trouble)
+                log.warning("nothing can be sent (%s); messages wait", answer.trouble)
             self.trouble = answer.trouble
             self._stopping.wait(max(answer.wait, pause * random.uniform(0.5, 1.0)))
             pause = min(2.0 * pause, LAST_PAUSE)
+
+    def _one(self) -> Answer | None:
+        """One attempt to send what is next; None where nothing waits."""
+        entry = self._spool.first()
+        if entry is None:
+            return None
+        answer = self._link.send(entry)
+        if answer.stored or answer.refused:
+            self._spool.done(entry)
+            if answer.refused:
+                log.error("the server will not take %s: %s", entry.name or entry.kind, answer.refused)
+            self.sent += answer.stored
+            self.refused += not answer.stored
+        return answer
 
 
 def _form(entry: SpoolEntry, vehicle: str) -> tuple[str, bytes]:

@@ -38,7 +38,7 @@ class SpoolEntry:
 
 
 class Spool:
-    """Safe to share between threads.  Raises UserError where the file cannot be used."""
+    """Safe to share between threads.  Raises UserError where the file cannot be used, later OSError while it cannot."""
 
     def __init__(self, path: Path, limit_bytes: int) -> None:
         """limit_bytes: of all bodies; raw recordings go before estimates when more comes."""
@@ -64,7 +64,7 @@ class Spool:
 
     def first(self) -> SpoolEntry | None:
         """What to send next: estimates before recordings, each oldest first."""
-        with self._lock:
+        with self._lock, _as_os_error():
             row = self._file.execute("SELECT id, kind, name, body FROM entries ORDER BY kind, id LIMIT 1").fetchone()
         return None if row is None else SpoolEntry(*row)
 
@@ -80,14 +80,14 @@ class Spool:
 
     def fact(self, name: str) -> Any:
         """A fact as it was kept last, or None."""
-        with self._lock:
+        with self._lock, _as_os_error():
             row = self._file.execute("SELECT value FROM facts WHERE name = ?", (name,)).fetchone()
         return None if row is None else json.loads(row[0])
 
     @property
     def waiting(self) -> tuple[int, int]:
         """Entries and their bytes."""
-        with self._lock:
+        with self._lock, _as_os_error():
             count, size = self._file.execute("SELECT count(*), coalesce(sum(bytes), 0) FROM entries").fetchone()
         return int(count), int(size)
 
@@ -98,14 +98,15 @@ class Spool:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._lock:
+        with self._lock, _as_os_error():
             self._file.execute("BEGIN IMMEDIATE")
             try:
                 yield self._file
+                self._file.execute("COMMIT")
             except BaseException:
-                self._file.execute("ROLLBACK")
+                if self._file.in_transaction:  # SQLite ends some by itself, of a disk that is full for instance
+                    self._file.execute("ROLLBACK")
                 raise
-            self._file.execute("COMMIT")
 
     @staticmethod
     def _set(file: sqlite3.Connection, facts: dict[str, Any]) -> None:
@@ -121,3 +122,12 @@ class Spool:
                 return dropped
             file.execute("DELETE FROM entries WHERE id = (SELECT id FROM entries ORDER BY kind DESC, id LIMIT 1)")
             dropped += 1
+
+
+@contextmanager
+def _as_os_error() -> Iterator[None]:
+    """What the file refuses is told as of any other file: whoever waits for a disk tries again."""
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        raise OSError(f"messages cannot be kept: {error}") from error

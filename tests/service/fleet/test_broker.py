@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy.exc import OperationalError
 
@@ -130,6 +131,27 @@ def test_a_message_that_cannot_be_folded_does_not_hold_up_the_others(
         return KafkaBroker(kafka)
 
     asyncio.run(until(opened, Ingest(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 3))
+    assert pipeline.state("north-1").used == 20
+    assert (counts.messages, counts.refused) == (2, 1)
+
+
+def test_a_message_that_fails_in_an_unforeseen_way_is_left_out_and_ends_no_consumer(
+    engine: Engine, system: System, pipeline: Pipeline
+) -> None:
+    good = messages(engine, system, 20, 10)
+    kafka = FakeKafka([encode(m, "exact") for m in (good[0], replace(good[0], vehicle="odd"), good[1])])
+    counts = ConsumerCounts()
+
+    class Odd(Ingest):
+        def take(self, found: Sequence[Any]) -> list[Any]:
+            if any(message.vehicle == "odd" for message in found):
+                raise np.linalg.LinAlgError("singular matrix")
+            return super().take(found)
+
+    async def opened() -> Broker:
+        return KafkaBroker(kafka)
+
+    asyncio.run(until(opened, Odd(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 3))
     assert pipeline.state("north-1").used == 20
     assert (counts.messages, counts.refused) == (2, 1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,7 +21,7 @@ from sprung.service.fleet.onboard import Onboard, OnboardSettings
 from sprung.service.fleet.sending import Answer, HttpLink, LinksByKind, Sending
 from sprung.service.fleet.spool import Spool, SpoolEntry
 from sprung.service.monitoring.engine import Engine
-from tests.service_fakes import make_window
+from tests.service_fakes import eventually, make_window
 
 
 @pytest.fixture
@@ -91,6 +92,40 @@ def test_the_sender_tries_until_it_is_taken_and_gives_up_what_never_will_be(spoo
     assert sending.close(10.0)
     assert link.seen == [b"one", b"one", b"one", b"two", b"three"]
     assert (sending.sent, sending.refused, sending.trouble) == (2, 1, "")
+
+
+def test_a_disk_that_is_full_ends_neither_the_sender_nor_the_spool(
+    spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool.add("estimates", b"1")
+    refusals = 2
+
+    class FullDisk:
+        """The spool's connection: it refuses to commit, or has ended the transaction by itself."""
+
+        def __init__(self, real: sqlite3.Connection) -> None:
+            self.real = real
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self.real, name)
+
+        def execute(self, statement: str, *given: Any) -> Any:
+            nonlocal refusals
+            if statement == "COMMIT" and refusals:
+                refusals -= 1
+                if refusals:
+                    self.real.execute("ROLLBACK")
+                raise sqlite3.OperationalError("database or disk is full")
+            return self.real.execute(statement, *given)
+
+    monkeypatch.setattr(spool, "_file", FullDisk(spool._file))
+    with pytest.raises(OSError, match="messages cannot be kept: database or disk is full"):
+        spool.add("estimates", b"2")
+    sending = Sending(spool, Unsteady([]), first_pause=0.01)
+    sending.start()
+    eventually(lambda: sending.sent == 1)
+    assert sending.close(5)
+    assert (refusals, sending.trouble) == (0, "")
 
 
 class EdgeReceiver(ThreadingHTTPServer):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import threading
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -208,7 +209,6 @@ def test_deliveries_at_once_are_folded_once(
         ({"start": 0}, "before the year 2000"),
         ({"start": 2**62}, "in the future"),
         ({"width": 3}, "3 parameters"),
-        ({"nan": True}, "not finite"),
     ],
 )
 def test_messages_that_cannot_be_folded_are_refused_and_leave_nothing(
@@ -223,12 +223,40 @@ def test_messages_that_cannot_be_folded_are_refused_and_leave_nothing(
     if "width" in change:
         narrow = replace(window.estimate, log_ratio=np.zeros(3), covariance=np.eye(3))
         bad = replace(bad, windows=(replace(window, estimate=narrow),))
-    if "nan" in change:
-        broken = replace(window.estimate, log_ratio=np.full_like(window.estimate.log_ratio, np.nan))
-        bad = replace(bad, windows=(replace(window, estimate=broken),))
     with pytest.raises(UserError, match=said):
         Ingest(pipeline, 0.0, Clock()).take([replace(good, vehicle="other"), bad])
     assert pipeline.state("other").used == 0
+
+
+def test_of_two_estimates_of_one_window_in_a_message_the_first_counts_and_the_other_is_known(
+    engine: Engine, system: System, pipeline: Pipeline
+) -> None:
+    good = messages(engine, system, 3, 3)[0]
+    taken = Ingest(pipeline, 0.0, Clock()).take([replace(good, windows=(*good.windows, good.windows[1]))])
+    assert (taken[0].folded, taken[0].waiting, taken[0].known) == (3, 0, 1)
+
+
+def test_windows_of_one_vehicle_that_cannot_be_folded_hold_up_no_other(
+    engine: Engine, system: System, pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    ingest = Ingest(pipeline, LATE, clock)
+    for vehicle in ("a", "b"):
+        first, _, third = messages(engine, system, 3, 1, vehicle)
+        ingest.take([first])
+        ingest.take([third])
+    clock.now += round(LATE * NANOSECONDS) + 1
+    real = ingest._fold_due
+
+    def failing(connection: Any, sent: Any, held: Any, now: int) -> Any:
+        if sent[0].vehicle == "a":
+            raise np.linalg.LinAlgError("singular")
+        return real(connection, sent, held, now)
+
+    monkeypatch.setattr(ingest, "_fold_due", failing)
+    before = {vehicle: pipeline.state(vehicle).used for vehicle in "ab"}
+    assert ingest.sweep() > 0
+    assert pipeline.state("a").used == before["a"] and pipeline.state("b").used > before["b"]
 
 
 def test_windows_wait_behind_a_gap_only() -> None:
