@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -325,12 +326,11 @@ def _parts_of(ray: KilledPart) -> list[KilledPart]:
         "door of Serve": ("ServeReplica:sprung:door",),
     }
     return [
-        KilledPart(name, lambda: None, lambda _, texts=texts: _kill_below(ray, *texts), ray.fed)  # type: ignore[misc]
-        for name, texts in named.items()
+        KilledPart(name, lambda: None, partial(_kill_process, ray, texts), ray.fed) for name, texts in named.items()
     ]
 
 
-def _kill_below(part: KilledPart, *names: str) -> None:
+def _kill_process(part: KilledPart, names: Sequence[str], _: object) -> None:
     """Kill one of the processes of a part, which starts another one itself."""
     found = [pid for name in names for pid in _below(part.process, name)]
     if found:

@@ -220,7 +220,7 @@ def _keep_errors(settings: PaperSettings, method: str, errors: dict[str, np.ndar
     """Gauge-free SE and PE of each test trajectory, for intervals and paired tests in the report."""
     folder = settings.out / settings.budget / "errors"
     folder.mkdir(parents=True, exist_ok=True)
-    np.savez(folder / f"{settings.task}-{method}-s{settings.seed}.npz", **errors)  # type: ignore[arg-type]
+    np.savez(folder / f"{settings.task}-{method}-s{settings.seed}.npz", **errors)  # type: ignore[arg-type]  # as arrays
 
 
 def _row(settings: PaperSettings, method: str, figures: dict[str, float | None]) -> dict[str, Any]:

@@ -90,7 +90,7 @@ def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[
             stages[stage] = stages.get(stage, 0.0) + seconds
 
     if times > 1:
-        reading.open_recording = _longer(reading.open_recording, times)  # type: ignore[attr-defined]
+        reading.open_recording = _longer(reading.open_recording, times)  # type: ignore[attr-defined]  # the child's own
     started = time.perf_counter()
     store, compute = open_store(store_file), Compute(8)
     fed = feed.feed_file(Pipeline(engine, store, compute), recording, on_batch=add)

@@ -142,7 +142,7 @@ def run(
     yield from lines
     if write is not None:
         before = json.loads(write.read_text(encoding="utf-8")) if write.exists() else {}
-        write.write_text(quoted(lines, done, f"recordings ({budget})", before), encoding="utf-8")
+        write.write_text(quoted(lines, done, f"recordings ({budget})", before, code=engine_digest()), encoding="utf-8")
     yield {
         "numbers": len(lines),
         "that_change_something": sum(bool(line["changed"]) for line in lines),
@@ -221,12 +221,13 @@ def quoted(
     subjects: str,
     before: dict[str, Any] | None = None,
     rules: RuleTable = RULES,
+    code: str = "",
 ) -> str:
     """What the reasons of the rules say of a run, as JSON of a line per number: what is said otherwise at which end.
 
     subjects: what they are, in words; before: what was known.  A number that is what it was, and was varied on more
-    recordings then, keeps that, and so
-    do numbers that this run did not vary.  The set that is named is the larger one.
+    recordings then, keeps that, and so do numbers that this run did not vary.  The set that is named is the larger one.
+    code: digest of the code by which these numbers were varied, kept with each.
     """
     before = before or {"recordings": [], "numbers": {}}
     known_of, smaller = before["numbers"], len(done) < len(before["recordings"])
@@ -239,6 +240,7 @@ def quoted(
             "recordings": line["recordings"],
             **({"on": line["on"]} if smaller or line["recordings"] <= _NAMED else {}),
             "changes": [_words(change) for change in line["changed"]],
+            **({"code": code} if code else {}),
         }
         for line in lines
         if line["recordings"]
@@ -253,6 +255,10 @@ def quoted(
     head = {"set": f"{len(done)} {subjects}", "recordings": [one["recording"] for one in done]}
     if smaller:
         head = {key: before[key] for key in head}
+    elif before.get("set") and before["set"] != head["set"]:  # numbers of before were varied on that
+        for name, found in numbers.items():
+            if "on" not in found and found is known_of.get(name):
+                numbers[name] = {"of": before["set"], **found}
     rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(found)}" for name, found in numbers.items())
     return f'{json.dumps(head)[:-1]},\n "numbers": {{\n{rows}\n}}}}\n'
 

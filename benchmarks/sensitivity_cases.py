@@ -293,10 +293,9 @@ def rig(random: np.random.Generator, seconds: float, imperfect: Imperfect = Impe
     """A damper with dry friction under sines."""
     t = np.arange(int(seconds * RATE)) / RATE - imperfect.late
     sines = imperfect.sines
-    d: FloatArray = sum(size * np.sin(2 * np.pi * f * t + phase) for size, f, phase in sines)  # type: ignore[assignment]
-    v: FloatArray = sum(  # type: ignore[assignment]
-        size * 2 * np.pi * f * np.cos(2 * np.pi * f * t + phase) for size, f, phase in sines
-    )
+    still = np.zeros_like(t)
+    d = sum((size * np.sin(2 * np.pi * f * t + phase) for size, f, phase in sines), start=still)
+    v = sum((size * 2 * np.pi * f * np.cos(2 * np.pi * f * t + phase) for size, f, phase in sines), start=still)
     falls = imperfect.rubs * (1 + imperfect.fall * (np.exp(-((v / 0.02) ** 2)) - 1))
     force = 3.6e4 * d + 1.3e3 * v + random.uniform(40.0, 160.0) * falls * np.tanh(v / 1e-3)
     noise = random.standard_normal((2, len(t)))

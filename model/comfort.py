@@ -11,6 +11,7 @@ Weightings are applied in the frequency domain: a digital filter at 100 Hz canno
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,7 +65,7 @@ def running_band(omega: FloatArray) -> np.ndarray:
     return analog_bandpass(4, 2 * np.pi * low, 2 * np.pi * high, omega)
 
 
-def weighted(values: FloatArray, rate: float, weighting) -> FloatArray:  # type: ignore[no-untyped-def]
+def weighted(values: FloatArray, rate: float, weighting: Callable[[np.ndarray], np.ndarray]) -> FloatArray:
     """Signals (T, S) through a response over frequency; zeros before and after."""
     size = len(values) + round(LEAD * rate)
     spectrum = np.fft.rfft(values, size, axis=0)

@@ -18,7 +18,7 @@ def reason_of(stage: str, number: Field[Any], varied: Mapping[str, Any]) -> str:
     low, high = number.metadata["range"]
     if found is None or found["varied"] != [number.default, low, high]:
         return f"{number.metadata['reason']}; not varied as it is now"
-    where = "; ".join(found.get("on", [f"{found['recordings']} of {varied['set']}"]))
+    where = "; ".join(found.get("on", [f"{found['recordings']} of {found.get('of', varied['set'])}"]))
     effect = f"insensitive from {low:g} to {high:g}"
     if found["changes"]:
         effect = f"changes {'; '.join(found['changes'])}"

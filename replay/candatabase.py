@@ -6,6 +6,7 @@ of DBC could take gigabytes.
 
 from __future__ import annotations
 
+from contextvars import ContextVar
 from pathlib import Path
 
 import cantools
@@ -25,6 +26,7 @@ def load_database(path: Path, strict: bool = False) -> Database:
 
     strict: refuse messages whose signals overlap or do not fit.
     """
+    within = _BOUNDED.set(True)
     try:
         _check_size(path)
         database = cantools.database.load_file(path, strict=strict)
@@ -34,6 +36,8 @@ def load_database(path: Path, strict: bool = False) -> Database:
         raise
     except Exception as error:
         raise UnreadableRecording(f"{path}: not a CAN database that can be read: {first_line(error)}") from error
+    finally:
+        _BOUNDED.reset(within)
     if not isinstance(database, Database):
         raise UnreadableRecording(f"{path}: a diagnostics database, not one of CAN messages")
     return database
@@ -51,17 +55,30 @@ def _check_size(path: Path) -> None:
         )
 
 
-def _bounded(self: Message, strict: bool | None = None) -> None:
-    """`Message.refresh`, which draws the bits, for messages that can be sent."""
-    if self.length > MOST_MESSAGE_BYTES:
-        raise ValueError(f"message {self.name} of {self.length} bytes, which nothing sends so")
-    for signal in self.signals:
+def _check_message(message: Message) -> None:
+    """Refuse a message that nothing can send."""
+    if message.length > MOST_MESSAGE_BYTES:
+        raise ValueError(f"message {message.name} of {message.length} bytes, which nothing sends so")
+    for signal in message.signals:
         if signal.start + signal.length > 8 * MOST_MESSAGE_BYTES:
             raise ValueError(
                 f"signal {signal.name}: {signal.length} bits from bit {signal.start} on, which no frame holds so"
             )
-    _refresh(self, strict)
 
 
-_refresh = Message.refresh
-Message.refresh = _bounded  # type: ignore[method-assign]
+_BOUNDED: ContextVar[bool] = ContextVar("within `load_database`", default=False)
+_REFRESH = Message.refresh
+
+
+def _refresh(self: Message, strict: bool | None = None) -> None:
+    """`Message.refresh`, which draws the bits, for messages that can be sent.
+
+    cantools asks nobody before it draws, so that its method is replaced; other users of it get what they had: only
+    `load_database` has bounds.
+    """
+    if _BOUNDED.get():
+        _check_message(self)
+    _REFRESH(self, strict)
+
+
+Message.refresh = _refresh  # type: ignore[method-assign]  # see there

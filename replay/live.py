@@ -102,7 +102,7 @@ class LiveBus:
         while not self.stop.is_set():
             self.beat = time.monotonic()  # a bus that is absent is looked for: the reader does not hang
             try:
-                with self._open() as bus:  # type: ignore[no-untyped-call]
+                with self._open() as bus:  # type: ignore[no-untyped-call]  # of python-can
                     widen(bus)
                     self._opened(bus)
                     for messages in self._receive(bus):

@@ -13,7 +13,7 @@ from sprung.replay.mcapfields import Field, TimeSource, Topic, parse_field
 from sprung.replay.mcapfile import DISORDER, Batch, McapFile
 
 SORTED_SAMPLES = 65_536  # handed out together from a recording that had to be sorted
-SOURCES = ("auto", "header", "publish", "log")
+SOURCES: tuple[TimeSource, ...] = ("auto", "header", "publish", "log")
 
 
 def blocks(
@@ -63,9 +63,10 @@ def _sorted(block: SampleBlock) -> SampleBlock:
 
 def _source(channel: Channel, time_source: str | Mapping[str, str]) -> TimeSource:
     name = time_source if isinstance(time_source, str) else time_source.get(channel.name, "auto")
-    if name not in SOURCES:
-        raise UnreadableRecording(f"time source {name!r} is not known; choose one of {', '.join(SOURCES)}")
-    return name  # type: ignore[return-value]
+    for source in SOURCES:
+        if source == name:
+            return source
+    raise UnreadableRecording(f"time source {name!r} is not known; choose one of {', '.join(SOURCES)}")
 
 
 def _topic(

@@ -20,6 +20,7 @@ from sprung.service.api import (
     fleet_knowledge,
     health,
     history,
+    idempotency,
     identify,
     ingest,
     lists,
@@ -98,6 +99,7 @@ def create_app(
         redirect_slashes=False,  # to an address made of the Host header, whatever that says
     )
     app.state.core = core
+    app.state.keys_at_work = idempotency.KeysAtWork()
     problems.install(app)
     describe(app)
     _route(app)

@@ -154,7 +154,7 @@ class Housekeeping:
             told = [row for *_, row in outbox.newest_of_sources(connection)]
             outbox.forget_deliveries(connection, now - DELIVERIES_KEPT, told)
             if not keep:
-                connection.get_transaction().rollback()  # type: ignore[union-attr]
+                connection.rollback()
                 return forgotten
         for name in forgotten.upload_files:
             (settings.uploads / name).unlink(missing_ok=True)

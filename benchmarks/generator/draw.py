@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -111,13 +112,14 @@ def _add_fault(case: Case, rng: np.random.Generator, kind: str, vehicle: Vehicle
     on_sensor = rng.random() < 0.75
     first = 2 * len(vehicle.inputs)
     index = int(rng.integers(first, len(channels)) if on_sensor else rng.integers(0, first))
-    value = {  # type: ignore[no-untyped-call]
+    draws: dict[str, Callable[[], float]] = {
         "sensor_gain": lambda: 1 + rng.choice([-1, 1]) * small * _log_uniform(rng, 0.01, 0.2),
         "sensor_lag": lambda: small * _log_uniform(rng, 5e-4, 0.012),
         "sensor_bias": lambda: rng.choice([-1, 1]) * noise[index] * small * _log_uniform(rng, 0.3, 30),
         "sensor_noise": lambda: _log_uniform(rng, 1.5, 10),
         "sensor_stuck": lambda: rng.uniform(5, 45),
-    }[kind]()
+    }
+    value = draws[kind]()
     case.fault = channels[index], kind, float(value)
 
 

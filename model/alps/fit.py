@@ -92,7 +92,7 @@ def train_frames(
 
     def draw(count: int, *key: int) -> Tensor:
         pick = np.random.default_rng([config.seed, *key]).integers(len(states), size=count)
-        return task.render(states[torch.from_numpy(pick)].to(device))  # type: ignore[misc]
+        return task.render(states[torch.from_numpy(pick)].to(device))  # type: ignore[misc]  # asserted above
 
     frames.standardise(draw(1000, 5), before=True)
     run = TrainingRun(frames, folder / "frames", config, _frames_name(task, config))

@@ -178,7 +178,7 @@ def _position_error(task: Task, states: Tensor, read: Tensor) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
-def _jacobian(function, at: Tensor, value: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+def _jacobian(function, at: Tensor, value: Tensor) -> Tensor:  # type: ignore[no-untyped-def]  # any function of one tensor
     """Forward differences of function (B, K) -> (B, R), all columns in one call: (B, R, K)."""
     batch, count = at.shape
     moved = at.repeat(count, 1)

@@ -48,20 +48,20 @@ def von_mises_divergence(angle: Tensor, concentration: Tensor) -> Tensor:
 
 def von_mises_sample(angle: Tensor, concentration: Tensor) -> Tensor:
     """Reparameterised draw of vM(angle, concentration), any shape; gradients reach both arguments."""
-    return angle + _Deviation.apply(concentration)  # type: ignore[no-untyped-call]
+    return angle + _Deviation.apply(concentration)  # type: ignore[no-untyped-call]  # torch's `apply`
 
 
 class _Deviation(torch.autograd.Function):
     """A draw of vM(0, k) by Best and Fisher's rejection (1979), differentiable in k."""
 
     @staticmethod
-    def forward(ctx, concentration: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+    def forward(ctx, concentration: Tensor) -> Tensor:  # type: ignore[no-untyped-def]  # a context of torch's
         draw = _best_fisher(concentration.double())
         ctx.save_for_backward(concentration, draw)
         return draw.to(concentration.dtype)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[no-untyped-def]
+    def backward(ctx, grad: Tensor) -> Tensor:  # type: ignore[no-untyped-def]  # a context of torch's
         concentration, draw = ctx.saved_tensors
         k = concentration.double()
         half = (draw / 2)[..., None]

@@ -20,7 +20,7 @@ def runge_kutta(derivative: Derivative, start: Tensor, samples: int, step: float
 
     Differentiable in `start` and `parameters` (B, P).
     """
-    path: Tensor = _Path.apply(derivative, samples, step, start, *parameters)  # type: ignore[no-untyped-call]
+    path: Tensor = _Path.apply(derivative, samples, step, start, *parameters)  # type: ignore[no-untyped-call]  # torch's `apply`
     return path
 
 
@@ -32,7 +32,7 @@ class _Path(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[no-untyped-def]
+    def forward(  # type: ignore[no-untyped-def]  # of torch's
         ctx, derivative: Derivative, samples: int, step: float, start: Tensor, *parameters: Tensor
     ) -> Tensor:
         states = [start]
@@ -44,7 +44,7 @@ class _Path(torch.autograd.Function):
         return path
 
     @staticmethod
-    def backward(ctx, grad: Tensor):  # type: ignore[no-untyped-def]
+    def backward(ctx, grad: Tensor):  # type: ignore[no-untyped-def]  # of torch's
         path, *parameters = ctx.saved_tensors
         with torch.enable_grad():
             before = path[:, :-1].detach().requires_grad_()  # (B, T - 1, N)

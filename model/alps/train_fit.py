@@ -135,6 +135,7 @@ class SensorAutoencoder(nn.Module):
         self.estimator = LogRatioEstimator((WINDOW // 2 + 1) * len(task.states), len(task.parameters))
         self.decoder = None if known else Readout(len(task.states) + inputs, sensors)
 
+    # four values, which the classes that call it name
     def forward(self, observations: Tensor, knots: Tensor, nominal: bool = False):  # type: ignore[no-untyped-def]
         """(B, T, 12), (B, T, 16) -> posterior, log-ratios, simulated states, decoded observations / scale.
 

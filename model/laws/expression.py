@@ -135,7 +135,7 @@ def _calculation(node: ast.expr) -> Callable[[Mapping[str, Any]], Any]:
     """What a checked node calculates: built once, since a simulation asks for it at every step."""
     match node:
         case ast.Constant(value=value):
-            number = float(value)  # type: ignore[arg-type]
+            number = float(value)  # type: ignore[arg-type]  # `parse` admits numbers alone
             return lambda values: number
         case ast.Name(id=name):
             return operator.itemgetter(name)
@@ -175,7 +175,7 @@ def _of_two(
 def _written(node: ast.expr, language: str, rename: Mapping[str, str]) -> str:
     match node:
         case ast.Constant(value=value):
-            return repr(float(value))  # type: ignore[arg-type]
+            return repr(float(value))  # type: ignore[arg-type]  # as above
         case ast.Name(id=name):
             return rename.get(name, name)
         case ast.UnaryOp(op=op, operand=operand):

@@ -287,11 +287,12 @@ class _Evidence:
     def averaged(self, best: tuple[float, float, float], s: float) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance over weights around the best ones: what their choice leaves open belongs to the band."""
         moves = [np.zeros(3)] + [step * axis for axis in np.eye(3) for step in (-4.0, -2.0, 2.0, 4.0)]
-        trials = [tuple(float(w) for w in np.array(best) * np.exp(move)) for move in moves]
-        evidence = np.array([self.log_evidence(trial, s) for trial in trials])  # type: ignore[arg-type]
+        around = (np.array(best) * np.exp(move) for move in moves)
+        trials = [(float(a), float(b), float(c)) for a, b, c in around]
+        evidence = np.array([self.log_evidence(trial, s) for trial in trials])
         shares = np.exp(evidence - evidence.max())
         shares /= shares.sum()
-        parts = [self.posterior(trial, s) for trial in trials]  # type: ignore[arg-type]
+        parts = [self.posterior(trial, s) for trial in trials]
         mean = np.sum([share * m for share, (m, _) in zip(shares, parts, strict=True)], axis=0)
         spread = [c + np.outer(m - mean, m - mean) for m, c in parts]
         return mean, np.sum([share * c for share, c in zip(shares, spread, strict=True)], axis=0)

@@ -212,10 +212,10 @@ def _samples(channels: object, form: WindowForm, wrong: list[dict[str, str]], pl
 
 def _numbers(channels: dict[str, object], length: int) -> FloatArray | None:
     """`length` finite numbers of each channel, shape (T, channels); None where any is anything else."""
-    lists = list(channels.values())
-    if not lists or not all(isinstance(samples, list) and len(samples) == length for samples in lists):
+    lists = [samples for samples in channels.values() if isinstance(samples, list) and len(samples) == length]
+    if not lists or len(lists) < len(channels):
         return None
-    samples: list[object] = list(chain.from_iterable(lists))  # type: ignore[arg-type]
+    samples: list[object] = list(chain.from_iterable(lists))
     if not set(map(type, samples)) <= {float, int}:
         return None
     try:
@@ -254,7 +254,7 @@ def _not_numbers(samples: object, length: int) -> tuple[str, str]:
 
 
 def _is_sample(value: object) -> bool:
-    return type(value) in (float, int) and bool(abs(value) <= LARGEST)  # type: ignore[arg-type]
+    return isinstance(value, float | int) and not isinstance(value, bool) and bool(abs(value) <= LARGEST)
 
 
 def start_of(head: WindowHead, now: int) -> int | None:

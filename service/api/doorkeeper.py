@@ -121,9 +121,10 @@ class Doorkeeper:
 
     def _is_proxy(self, host: str) -> bool:
         try:
-            return any(ipaddress.ip_network(host).subnet_of(proxy) for proxy in self._proxies)  # type: ignore[arg-type]
-        except (ValueError, TypeError):  # no address; of the other version
+            address = ipaddress.ip_address(host)
+        except ValueError:
             return False
+        return any(address in proxy for proxy in self._proxies)
 
     def _yielding(self, host: str) -> Connection | None:
         """The connection that is closed for a new one of a client; None where all are as worthy."""

@@ -12,7 +12,8 @@ from __future__ import annotations
 import hashlib
 import json
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 from fastapi import Depends, Header, Request
@@ -34,8 +35,29 @@ from sprung.service.times import NANOSECONDS
 
 KEPT = LONGEST_PAUSE + 86_400 * NANOSECONDS  # a day, though the host's clock leaps while the service is stopped
 Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=200, description="sent twice, carried out once")]
-_running: set[str] = set()
-_lock = threading.Lock()
+
+
+class KeysAtWork:
+    """Keys of the requests of one application that are being worked on."""
+
+    def __init__(self) -> None:
+        self._keys: set[str] = set()
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def holding(self, key: str) -> Iterator[None]:
+        """While a request is carried out; raises ApiProblem for a second one."""
+        with self._lock:
+            if key in self._keys:
+                raise ApiProblem(
+                    409, "a request with this Idempotency-Key is being worked on", headers={"Retry-After": "1"}
+                )
+            self._keys.add(key)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._keys.discard(key)
 
 
 class IdempotentRequests:
@@ -57,22 +79,14 @@ class IdempotentRequests:
         """The answer of `act`, or the one that was given before.  Errors are not kept."""
         if self._key is None:
             return await act()
-        with _lock:
-            if self._key in _running:
-                raise ApiProblem(
-                    409, "a request with this Idempotency-Key is being worked on", headers={"Retry-After": "1"}
-                )
-            _running.add(self._key)
-        try:
+        at_work: KeysAtWork = self._http.app.state.keys_at_work
+        with at_work.holding(self._key):
             kept = await run_in_threadpool(self._find)
             if kept is not None:
                 return await self._again(kept)
             response = await act()
             await run_in_threadpool(self._keep, response)
             return response
-        finally:
-            with _lock:
-                _running.discard(self._key)
 
     def _find(self) -> Row[Any] | None:
         table, now = idempotency, self._core.housekeeping.clock.now(keep=False)

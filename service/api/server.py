@@ -51,7 +51,7 @@ class GuardedProtocol(H11Protocol):
     doorkeeper: Doorkeeper
     _lingers: asyncio.TimerHandle | None = None  # of one that was refused: when it is closed all the same
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
         """A client connects."""
         super().connection_made(transport)
         self.host = client_of(self.client[0] if self.client else "")
@@ -209,7 +209,8 @@ class Server(uvicorn.Server):
         """Begin to watch with the first connection."""
         if self.config.ssl is not None:
             loop, seconds = asyncio.get_running_loop(), self.doorkeeper.header_seconds
-            loop.create_server = partial(loop.create_server, ssl_handshake_timeout=seconds)  # type: ignore[method-assign]
+            in_time = partial(loop.create_server, ssl_handshake_timeout=seconds)
+            loop.create_server = in_time  # type: ignore[method-assign]  # uvicorn passes no such option on
         await super().startup(sockets)
         self._watching = asyncio.create_task(self.doorkeeper.watch())
 

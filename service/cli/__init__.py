@@ -36,8 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (KeyboardInterrupt, typer.Abort):
         status = INTERRUPTED  # older versions of typer raise, newer ones return it
     except Exception as error:
-        if type(error).__name__ == "NoArgsIsHelpError":  # of click, or of the copy of it inside typer
-            print(error.format_message())  # type: ignore[attr-defined]
+        if type(error).__name__ == "NoArgsIsHelpError":
+            print(error.format_message())  # type: ignore[attr-defined]  # of click, or of the copy of it inside typer
             return USAGE
         if os.environ.get("SPRUNG_DEBUG"):
             raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
 
@@ -105,13 +105,13 @@ def _set_value(entry: Any, quantity: str, value: float) -> None:
 
 def _drop_laws(entry: Any, undone: set[str]) -> None:
     """Take out laws, whose values come anew; faults of measurements stay: they were undone before."""
-    if not isinstance(entry, Mapping):
+    if not isinstance(entry, MutableMapping):
         return
     if "laws" in entry:
         kept = [law for law in entry["laws"] if undone.issuperset(law)]
-        del entry["laws"]  # type: ignore[attr-defined]
+        del entry["laws"]
         if kept:
-            entry["laws"] = kept  # type: ignore[index]
+            entry["laws"] = kept
 
 
 def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> None:

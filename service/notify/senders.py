@@ -71,7 +71,7 @@ class _BoundedSmtp(smtplib.SMTP):
     _ended: threading.Timer | None = None
 
     def _get_socket(self, host: str, port: int, timeout: float) -> socket.socket:
-        line: socket.socket = super()._get_socket(host, port, timeout)  # type: ignore[misc]
+        line: socket.socket = super()._get_socket(host, port, timeout)  # type: ignore[misc]  # a hook that typeshed leaves out
         self._ended = outside.hung_up_after(line, MAIL_SECONDS)
         return line
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import fields
 from typing import Any, TypeVar
 
 from sqlalchemy import Connection, Table, and_, or_, select
@@ -12,7 +12,7 @@ from sprung.service.store.outbox import DeliveryRow
 from sprung.service.store.schema import deliveries, jobs, recordings, reports
 from sprung.service.store.work import JobRow, RecordingRow, ReportRow
 
-T = TypeVar("T")
+T = TypeVar("T", JobRow, RecordingRow, ReportRow, DeliveryRow)
 Cursor = tuple[int, str]  # (created, id) of the last row of the page before
 
 
@@ -60,12 +60,12 @@ def parse_cursor(text: str | None) -> Cursor | None:
 def _page(
     connection: Connection,
     table: Table,
-    make: Callable[..., T],
+    make: type[T],
     limit: int,
     after: Cursor | None,
     equal: dict[str, str | None],
 ) -> list[T]:
-    names = [name for name in make.__slots__ if name in table.c]  # type: ignore[attr-defined]
+    names = [one.name for one in fields(make) if one.name in table.c]
     query = select(*(table.c[name] for name in names)).order_by(table.c.created_ns.desc(), table.c.id.desc())
     for name, value in equal.items():
         if value is not None:

@@ -13,6 +13,7 @@ import pytest
 from sprung.benchmarks.sensitivity import ReportedResult, Subject, figure, quoted, run, vary
 from sprung.benchmarks.sensitivity_cases import recordings, rig
 from sprung.model.diagnosis.rules import RULES, Rules
+from sprung.model.rule import reason_of
 
 HEALTHY = ReportedResult("consistent", (), ())
 RUBBING = ReportedResult("missing_physics", (("k1", "coulomb_friction"),), (1e-9,))
@@ -70,6 +71,19 @@ def test_numbers_and_recordings_can_be_asked_for_alone_and_others_keep_what_was_
     assert known["component.most"] == before and known["report.sure"]["recordings"] == 1
 
 
+def test_a_number_that_was_varied_on_an_earlier_set_names_that_one() -> None:
+    done = [{"recording": name, "varied": {"verdict.clear": varied("verdict", "clear")}} for name in ("made", "other")]
+    lines = [figure(stage, field, done) for stage, field in RULES.constants() if stage == "verdict"]
+    known = {"varied": [RULES.fit.prior, 1.0, 100.0], "recordings": 1, "changes": []}
+    before = {"set": "1 recordings (quick)", "recordings": ["made"], "numbers": {"fit.prior": known}}
+    found = json.loads(quoted(lines, done, "recordings (quick)", before))
+    assert found["set"] == "2 recordings (quick)" and found["numbers"]["fit.prior"]["of"] == "1 recordings (quick)"
+    number = next(one for stage, one in RULES.constants() if (stage, one.name) == ("fit", "prior"))
+    ends = {"varied": [number.default, *number.metadata["range"]]}
+    found["numbers"]["fit.prior"] |= ends
+    assert "on 1 of 1 recordings (quick) insensitive" in reason_of("fit", number, found)
+
+
 def test_made_recordings_of_a_rig_repeat_with_their_seed() -> None:
     first, again = (rig(np.random.default_rng(1), 2.0) for _ in range(2))
     assert np.array_equal(first.values, again.values) and first.values.shape == (200, 2)
@@ -107,8 +121,8 @@ def test_what_is_quoted_of_a_run_is_json_of_every_number_that_was_varied() -> No
     told = varied("verdict", "clear")
     done = [{"recording": "made", "varied": {"verdict.clear": told}}]
     lines = [figure(stage, field, done) for stage, field in RULES.constants()]
-    found = json.loads(quoted(lines, done, "recordings (quick)"))
-    assert list(found["numbers"]) == ["verdict.clear"]
+    found = json.loads(quoted(lines, done, "recordings (quick)", code="0123abcd"))
+    assert list(found["numbers"]) == ["verdict.clear"] and found["numbers"]["verdict.clear"]["code"] == "0123abcd"
     (change,) = found["numbers"]["verdict.clear"]["changes"]
     assert change == "at 2 the verdict in made: missing_physics -> consistent"
 

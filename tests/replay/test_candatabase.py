@@ -6,10 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from cantools.database import Message
 
 from sprung.replay import candatabase
 from sprung.replay.account import UnreadableRecording
-from sprung.replay.candatabase import load_database
+from sprung.replay.candatabase import MOST_MESSAGE_BYTES, load_database
 
 DBC = 'VERSION ""\n\nBO_ 1 M: {length} A\n SG_ X{between}: 0|{bits}@1+ (1,0) [0|1] "" A\n'
 KCD = (
@@ -40,6 +41,11 @@ def test_so_is_that_of_another_format(tmp_path: Path) -> None:
 def test_a_message_of_gigabytes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UnreadableRecording, match="message M of 4000000000 bytes"):
         load_database(written(tmp_path, "a.dbc", DBC.format(length=4 * 10**9, between=" ", bits=8)))
+
+
+def test_others_who_use_the_reader_of_databases_are_not_bounded() -> None:
+    """A process that imports Sprung still makes what messages it wants."""
+    assert Message(1, "M", MOST_MESSAGE_BYTES + 1, []).length == MOST_MESSAGE_BYTES + 1
 
 
 @pytest.mark.parametrize("length", [8, 1785, 4095], ids=["a frame", "SAE J1939", "ISO 15765"])

@@ -231,8 +231,13 @@ def _support_motion(projector: Projector, support: int) -> ComplexArray:
 def _sizes(system: System) -> tuple[float, float]:
     """Typical stiffness and damping of a system."""
     mechanics = system.mechanics
-    sizes = [values[values > 0] for values in (mechanics.stiffness, mechanics.damping)]
-    return tuple(float(np.median(size)) if len(size) else 1.0 for size in sizes)  # type: ignore[return-value]
+    stiffness, damping = (values[values > 0] for values in (mechanics.stiffness, mechanics.damping))
+    return _median(stiffness), _median(damping)
+
+
+def _median(values: FloatArray) -> float:
+    """Of what there is; 1 of nothing."""
+    return float(np.median(values)) if len(values) else 1.0
 
 
 def _columns(
