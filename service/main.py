@@ -31,6 +31,7 @@ from sprung.service.jobs.recordings import add_row, file_row, finish_row, readin
 from sprung.service.lock import held
 from sprung.service.monitoring.engine import load_engine
 from sprung.service.monitoring.numerics import numerics
+from sprung.service.observability.connections import ConnectionCollector
 from sprung.service.processes.worker import ProcessLimits
 from sprung.service.settings import Settings
 from sprung.service.sources.feed import FeedResult, OnBatch, feed_file, vehicle_of
@@ -94,6 +95,8 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
             server = make_server(create_app(core, start, stop), settings, core.stopping.set)
         except (OSError, ssl.SSLError) as error:
             raise UserError(f"TLS: {settings.tls_certificate}: {error.strerror or error}") from error
+        door = server.doorkeeper
+        core.metrics.registry.register(ConnectionCollector(lambda: len(door), lambda: door.closed))
         # uvicorn raises the signal that stopped it again when it is done: for a service that is a good end
         stack.callback(signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, _exit))
         server.run(sockets=[listening])

@@ -6,6 +6,7 @@ import time
 from datetime import UTC, datetime
 
 NANOSECONDS = 1_000_000_000
+FIRST_TIME = 946_684_800 * NANOSECONDS  # 2000: before it no clock of a vehicle was right
 AHEAD = 300 * NANOSECONDS  # ns that a vehicle's clock may be ahead of this host's
 
 

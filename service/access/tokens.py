@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from cachetools import TTLCache
+from sqlalchemy import Connection
 
 from sprung.model.text import IN_VEHICLE_IDS, hidden_character
 from sprung.service.errors import NotFound, UserError
@@ -95,17 +96,23 @@ class Tokens:
             raise UserError(f"no vehicle's id can begin with {fleet!r}: letters, digits and . _ : - only")
         if days is not None and not 0 < days < 36_500:
             raise UserError("a token lasts for more than 0 and less than 36500 days")
+        text, row = self._made(name, scopes, fleet, days)
+        with self._store.write() as connection:
+            self._add(connection, row, "create token", {}, by)
+        self._forget()
+        return text, row
+
+    def _made(self, name: str, scopes: Sequence[str], fleet: str, days: float | None) -> tuple[str, TokenRow]:
         token_id, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
         text = f"{PREFIX}_{token_id}_{secret}"
         now = self._clock()
         expires = None if days is None else now + round(days * DAY)
-        row = TokenRow(token_id, digest_of(text), name, list(scopes), fleet, now, expires, None, None)
-        with self._store.write() as connection:
-            tokens.add(connection, row)
-            detail = {"name": name, "scopes": list(scopes), "fleet": fleet}
-            audit.record(connection, by, "create token", token_id, detail, now)
-        self._forget()
-        return text, row
+        return text, TokenRow(token_id, digest_of(text), name, list(scopes), fleet, now, expires, None, None)
+
+    def _add(self, connection: Connection, row: TokenRow, action: str, more: dict[str, str], by: str) -> None:
+        tokens.add(connection, row)
+        detail = {"name": row.name, "scopes": row.scopes, "fleet": row.fleet} | more
+        audit.record(connection, by, action, row.id, detail, row.created_ns)
 
     def rotate(self, token_id: str, hours: float = 24.0, by: str = "local") -> tuple[str, TokenRow, int]:
         """A new token like an old one, which ends in `hours`, if it does not end before; its text, its row, and when
@@ -121,8 +128,9 @@ class Tokens:
         if (wrong := _worthless(old, now)) is not None:
             raise UserError(f"token {token_id}: {wrong}; make a new one")
         left = None if old.expires_ns is None else max((old.expires_ns - old.created_ns) / DAY, 1e-6)
-        text, row = self.create(old.name, old.scopes, old.fleet, left, by)
+        text, row = self._made(old.name, old.scopes, old.fleet, left)
         with self._store.write() as connection:
+            self._add(connection, row, "rotate token", {"before": token_id}, by)
             ends = tokens.expire(connection, token_id, now + round(hours * 3600 * NANOSECONDS))
         self._forget()
         return text, row, ends

@@ -21,7 +21,7 @@ from sprung.service.api.problems import ApiProblem
 from sprung.service.api.queries import Id, Limit
 from sprung.service.store import fleet, marks
 from sprung.service.store.marks import MarkRow
-from sprung.service.times import from_iso, to_iso
+from sprung.service.times import AHEAD, from_iso, now_ns, to_iso
 
 router = APIRouter(tags=["operation"])
 Text = Annotated[
@@ -168,6 +168,7 @@ def _time(text: str | None) -> int | None:
         time = from_iso(text)
     except (ValueError, OverflowError):
         time = -1
-    if not 0 <= time < 2**63:
-        raise ApiProblem(422, "time is no RFC 3339 time", [{"field": "time", "detail": "is no RFC 3339 time"}])
+    wrong = "is no RFC 3339 time" if time < 0 else "is in the future" if time > now_ns() + AHEAD else None
+    if wrong is not None:  # what is still to come would be the newest of the time line until then
+        raise ApiProblem(422, f"time {wrong}", [{"field": "time", "detail": wrong}])
     return time

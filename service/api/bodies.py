@@ -17,7 +17,7 @@ from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validatio
 from sprung.service.api.twice import keys_twice
 from sprung.service.fleet.message import SentWindows
 from sprung.service.monitoring.form import WindowForm
-from sprung.service.times import NANOSECONDS, from_iso, to_iso
+from sprung.service.times import FIRST_TIME, NANOSECONDS, from_iso, to_iso
 
 VEHICLE_ID = re.compile(rf"^[A-Za-z0-9][{IN_VEHICLE_IDS}]{{0,127}}$")
 
@@ -273,6 +273,8 @@ def _time(text: str, now: int, place: str = "") -> int:
         start = -1
     if not 0 <= start < 2**63:
         raise _refused([_wrong(f"{place}start", "is no RFC 3339 time")])
+    if start < FIRST_TIME:
+        raise _refused([_wrong(f"{place}start", "is before the year 2000: the clock was not set")])
     if start > now + FUTURE_SECONDS * NANOSECONDS:
         detail = f"is more than {FUTURE_SECONDS // 60} minutes after {to_iso(now)}, the service's time"
         raise _refused([_wrong(f"{place}start", detail)])

@@ -12,7 +12,7 @@ from sqlalchemy import Connection
 
 from sprung.service.access.tokens import Actor
 from sprung.service.api import job_models
-from sprung.service.api.access import CoreOf, known_vehicle, note, read
+from sprung.service.api.access import CoreOf, known_vehicle, noting, read
 from sprung.service.api.actors import ActorOf, own_vehicle
 from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import DiagnoseBody
@@ -62,7 +62,6 @@ async def diagnose(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf)
             job = await _of_reference(request, core, actor)
         else:
             raise ApiProblem(415, "send multipart/form-data with a file, or application/json")
-        await note(core, actor, "diagnose", job.id, {"vehicle": job.vehicle_id})
         return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
 
     return await once.answer(act)
@@ -112,7 +111,8 @@ async def _of_upload(request: Request, core: Core, actor: Actor, once: Idempoten
     async with receive(request, core) as found:
         once.received(found.identity)
         own_vehicle(actor, found.vehicle)
-        return await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle)
+        noted = noting(actor, "diagnose")
+        return await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle, noted)
 
 
 async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
@@ -130,7 +130,7 @@ async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
         vehicle = str(body.vehicle)
         own_vehicle(actor, vehicle)
         known_vehicle(await read(core, lambda c: fleet.vehicle_exists(c, vehicle)), vehicle)
-        return await run_in_threadpool(core.diagnoses.from_excerpt, vehicle)
+        return await run_in_threadpool(core.diagnoses.from_excerpt, vehicle, noting(actor, "diagnose"))
     recording = body.recording
 
     def query(connection: Connection) -> RecordingRow:
@@ -139,7 +139,8 @@ async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
             raise NotFound(f"no recording {recording!r}")
         return row
 
-    return await run_in_threadpool(core.diagnoses.from_recording, await read(core, query), None)
+    row = await read(core, query)
+    return await run_in_threadpool(core.diagnoses.from_recording, row, None, noting(actor, "diagnose"))
 
 
 async def _report(core: Core, actor: Actor, report_id: str) -> ReportRow:

@@ -23,6 +23,10 @@ MOST_LINGERING = 64  # refused connections that still get an answer; not counted
 BURST_SECONDS = 2.0  # of the permitted rate of broken-off requests that may come at once
 MOST_CLIENTS = 10_000  # whose broken-off requests are remembered
 MOST_UNSENT_BYTES = 200_000_000  # of answers that clients have not taken, of all together
+# why connections are closed that their clients did not end
+NO_ROOM, BROKEN_OFF = "refused: no room", "refused: too many broken off"
+GIVEN_UP, TOO_SLOW, UNREAD = "given up for another", "too slow", "answers not taken"
+CAUSES = (NO_ROOM, BROKEN_OFF, GIVEN_UP, TOO_SLOW, UNREAD)
 
 
 class Connection(Protocol):
@@ -64,7 +68,7 @@ class Doorkeeper:
         self._open: dict[Connection, None] = {}
         self._clients: Counter[str] = Counter()
         self.lingering = 0
-        self.refused = 0
+        self.closed = dict.fromkeys(CAUSES, 0)
 
     def __len__(self) -> int:
         return len(self._open)
@@ -72,14 +76,14 @@ class Doorkeeper:
     def admit(self, new: Connection) -> bool:
         """Whether there is room for a connection; closes another one for it where it can."""
         if self._broken.full(new.host):
-            self.refused += 1
+            self.closed[BROKEN_OFF] += 1
             return False
         if self._clients[new.host] >= self._most_each or len(self._open) >= self._most:
             yielding = self._yielding(new.host)
             if yielding is None:
-                self.refused += 1
+                self.closed[NO_ROOM] += 1
                 return False
-            self._evict(yielding)
+            self._evict(yielding, GIVEN_UP)
         self._open[new] = None
         self._clients[new.host] += 1
         return True
@@ -107,7 +111,7 @@ class Doorkeeper:
         while total > MOST_UNSENT_BYTES:
             heaviest = max(waiting, key=waiting.__getitem__)
             total -= waiting.pop(heaviest)
-            self._evict(heaviest)
+            self._evict(heaviest, UNREAD)
 
     async def watch(self) -> None:
         """Close connections whose requests do not arrive, or whose answers are not taken; runs as long as the
@@ -117,6 +121,7 @@ class Doorkeeper:
             now = time.monotonic()
             for connection in list(self._open):
                 if connection.too_slow(now):
+                    self.closed[TOO_SLOW] += 1
                     connection.end()
 
     def _is_proxy(self, host: str) -> bool:
@@ -140,7 +145,8 @@ class Doorkeeper:
     def _of(self, host: str) -> list[Connection]:
         return [connection for connection in self._open if connection.host == host]
 
-    def _evict(self, connection: Connection) -> None:
+    def _evict(self, connection: Connection, cause: str) -> None:
+        self.closed[cause] += 1
         connection.end()
         self.leave(connection)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
@@ -20,7 +21,9 @@ from fastapi import Depends, Header, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sqlalchemy import Row, delete, select
+from sqlalchemy.exc import SQLAlchemyError
 
+from sprung.model.text import first_line
 from sprung.service.api.access import CoreOf
 from sprung.service.api.actors import ActorOf
 from sprung.service.api.answers import json_response
@@ -33,6 +36,7 @@ from sprung.service.store.engine import insert_or_ignore
 from sprung.service.store.schema import idempotency
 from sprung.service.times import NANOSECONDS
 
+log = logging.getLogger("sprung.api")
 KEPT = LONGEST_PAUSE + 86_400 * NANOSECONDS  # a day, though the host's clock leaps while the service is stopped
 Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=200, description="sent twice, carried out once")]
 
@@ -85,7 +89,13 @@ class IdempotentRequests:
             if kept is not None:
                 return await self._again(kept)
             response = await act()
-            await run_in_threadpool(self._keep, response)
+            try:
+                await run_in_threadpool(self._keep, response)
+            except (
+                SQLAlchemyError,
+                OSError,
+            ) as error:  # it is done: told otherwise, the client would have it done twice
+                log.warning("the answer to an Idempotency-Key is not kept: %s", first_line(error))
             return response
 
     def _find(self) -> Row[Any] | None:

@@ -95,7 +95,8 @@ def ingest_app(settings: Settings, store: Store, behind: Behind) -> FastAPI:
         try:
             await run_in_threadpool(store.probe)
         except (SQLAlchemyError, OSError, TimeoutError) as error:
-            raise ApiProblem(503, "the store does not take anything at the moment") from error
+            detail = "the store does not take anything at the moment"
+            raise ApiProblem(503, detail, headers={"Retry-After": "5"}) from error
         return json_response({"status": "ok"})
 
     app.add_middleware(BodyLimit, limit=settings.max_body_bytes, paths={})

@@ -28,6 +28,7 @@ SHOWN_ERRORS = 20  # of a body with thousands of wrong numbers
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 WAIT = {"Retry-After": "10"}
+ROOM = {"Retry-After": "600"}  # for which an upload waits: housekeeping makes room every hour
 
 log = logging.getLogger("sprung.api")
 
@@ -159,7 +160,7 @@ def _as_problem(error: Exception) -> ApiProblem:
         case UserError():
             return ApiProblem(422, str(error))
         case NoSpace():
-            return ApiProblem(507, str(error))
+            return ApiProblem(507, str(error), headers=ROOM)
         case SQLAlchemyError() | OSError() | MemoryError() | RuntimeError() if found := _resource_problem(error):
             log.error("%s: %s", found.detail, error)
             return found

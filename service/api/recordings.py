@@ -10,7 +10,7 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.service.api import job_models
-from sprung.service.api.access import CoreOf, note, read
+from sprung.service.api.access import CoreOf, noting, read
 from sprung.service.api.actors import ActorOf, own_vehicle
 from sprung.service.api.answers import json_response
 from sprung.service.api.idempotency import OnceOf
@@ -44,8 +44,8 @@ async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -
         async with receive(request, core) as found:
             once.received(found.identity)
             own_vehicle(actor, found.vehicle)
-            job = await run_in_threadpool(core.jobs.submit, "recording", found.row, found.vehicle)
-        await note(core, actor, "upload", job.id, {"name": found.row.name, "vehicle": found.vehicle})
+            noted = noting(actor, "upload", {"name": found.row.name, "vehicle": found.vehicle})
+            job = await run_in_threadpool(core.jobs.submit, "recording", found.row, found.vehicle, noted)
         return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
 
     return await once.answer(act)
@@ -70,7 +70,6 @@ async def cancel(core: CoreOf, actor: ActorOf, id: str) -> Response:
     stored before stays."""
     await job(core, actor, id)
     row = await run_in_threadpool(core.jobs.cancel, id, actor.name)
-    await note(core, actor, "cancel job", id)
     return json_response(job_dict(row))
 
 

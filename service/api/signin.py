@@ -12,7 +12,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
-from sprung.service.access.oidc import CALLBACK, Provider, Unreachable
+from sprung.service.access.oidc import AGAIN_SECONDS, CALLBACK, Provider, Unreachable
 from sprung.service.access.tokens import SESSION_SECONDS, Refused
 from sprung.service.api.access import CoreOf, note
 from sprung.service.api.guard import COOKIE, session_of
@@ -109,7 +109,8 @@ async def sign_out(request: Request, core: CoreOf) -> Response:
 
 
 def _form(core: Core, to: str, wrong: str = "", status: int = 200) -> HTMLResponse:
-    return HTMLResponse(render("signin.html", to=to, wrong=wrong, elsewhere=core.oidc is not None), status)
+    headers = {"Retry-After": f"{AGAIN_SECONDS:.0f}"} if status == 503 else None
+    return HTMLResponse(render("signin.html", to=to, wrong=wrong, elsewhere=core.oidc is not None), status, headers)
 
 
 def _provider(core: Core) -> Provider:

@@ -20,7 +20,7 @@ from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Sta
 from sprung.service.diagnosis.worker import run
 from sprung.service.durable import sync_folder, sync_tree
 from sprung.service.errors import Busy, UserError
-from sprung.service.jobs.queue import Jobs, Progress
+from sprung.service.jobs.queue import Jobs, Noted, Progress
 from sprung.service.jobs.recordings import stored_file
 from sprung.service.monitoring.engines import ServedModel
 from sprung.service.monitoring.pipeline import Pipeline
@@ -79,7 +79,7 @@ class Diagnoses:
         """The samples that are held of a vehicle."""
         return self._rings.excerpt(vehicle)
 
-    def from_excerpt(self, vehicle: str) -> JobRow:
+    def from_excerpt(self, vehicle: str, noted: Noted = lambda connection, job: None) -> JobRow:
         """Accept a diagnosis of a vehicle's last minute.  Raises UserError when nothing is held of it, or Busy."""
         excerpt = self._rings.excerpt(vehicle)
         if excerpt is None:
@@ -89,11 +89,13 @@ class Diagnoses:
         with kept_excerpt(self._settings.uploads, excerpt) as path:
             size = path.stat().st_size
             row = RecordingRow(work.new_id(), vehicle, label, "excerpt", path.name, size, None, now_ns(), None)
-            return self._jobs.submit("diagnosis", row, vehicle)
+            return self._jobs.submit("diagnosis", row, vehicle, noted)
 
-    def from_recording(self, row: RecordingRow, vehicle: str | None) -> JobRow:
+    def from_recording(
+        self, row: RecordingRow, vehicle: str | None, noted: Noted = lambda connection, job: None
+    ) -> JobRow:
         """Accept a diagnosis of a recording in the upload folder."""
-        return self._jobs.submit("diagnosis", row, vehicle or row.vehicle_id)
+        return self._jobs.submit("diagnosis", row, vehicle or row.vehicle_id, noted)
 
     def _runs(self, job_id: str | None) -> bool:
         if job_id is None:

@@ -25,11 +25,10 @@ from sprung.service.store import pending
 from sprung.service.store.partitions import prepare
 from sprung.service.store.pending import Waiting
 from sprung.service.store.windows import known_starts, newest_start
-from sprung.service.times import AHEAD, NANOSECONDS, now_ns, to_iso
+from sprung.service.times import AHEAD, FIRST_TIME, NANOSECONDS, now_ns, to_iso
 
 log = logging.getLogger("sprung.ingest")
 SWEEP_SECONDS = 1.0
-FIRST_TIME = 946_684_800 * NANOSECONDS  # 2000: before it no clock of a vehicle was right
 CONTIGUOUS = 1.01  # hops: a window that begins so long after the last one follows it
 
 

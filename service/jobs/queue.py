@@ -22,7 +22,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sprung.service.errors import Busy, NotFound, UserError
 from sprung.service.insisting import insist, told
 from sprung.service.observability.queues import WaitMetrics
-from sprung.service.store import Store, work
+from sprung.service.store import Store, audit, work
 from sprung.service.times import NANOSECONDS, now_ns
 
 log = logging.getLogger("sprung.jobs")
@@ -94,6 +94,7 @@ class Progress:
         self.check()
 
 
+Noted = Callable[[Connection, work.JobRow], None]
 Handler = Callable[[work.JobRow, Progress], dict[str, Any]]
 
 
@@ -144,10 +145,17 @@ class Jobs:
         if self._waiting >= self._limit or self._stopping.is_set():
             raise Busy(f"{self._waiting} jobs are waiting already; try again later", retry_after=30)
 
-    def submit(self, kind: str, recording: work.RecordingRow | None = None, vehicle: str | None = None) -> work.JobRow:
+    def submit(
+        self,
+        kind: str,
+        recording: work.RecordingRow | None = None,
+        vehicle: str | None = None,
+        noted: Noted = lambda connection, job: None,
+    ) -> work.JobRow:
         """Accept a job: it is in the store when this returns.  Raises Busy when too many wait.
 
-        One that does the same and has not ended is the answer instead.
+        One that does the same and has not ended is the answer instead.  noted: called with the answer in the same
+        transaction, to write down who asked.
         """
         self.reserve()
         now = now_ns()
@@ -158,9 +166,11 @@ class Jobs:
             if recording_id is not None:
                 waiting = work.waiting_job(connection, kind, recording_id, vehicle)
                 if waiting is not None:
+                    noted(connection, waiting)
                     return waiting
             job = work.JobRow(work.new_id(), kind, "queued", recording_id, vehicle, 0.0, None, None, now, now)
             work.add_job(connection, job)
+            noted(connection, job)
         self._enqueue(job)
         return job
 
@@ -170,6 +180,7 @@ class Jobs:
             job = work.get_job(connection, job_id)
             if job is None:
                 raise NotFound(f"no job {job_id[:36]!r}")
+            audit.record(connection, by, "cancel job", job_id, None, now_ns())
             if job.state in work.UNFINISHED:
                 work.update_job(connection, job_id, now_ns(), state="failed", error=f"cancelled by {by}"[:500])
         running = self._current.get(job_id)

@@ -1,6 +1,6 @@
 """Who did what, and when; never changed.
 
-What is done in the store is noted in the transaction of the deed itself; uploads, jobs and their ends right after them.
+A deed is noted in the transaction that does it; signing in and out, which the store does not know, right after it.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from pydantic import SecretStr
+from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import System
 from sprung.service.access.notice import access_notice, is_loopback
@@ -235,6 +236,9 @@ def test_a_token_is_rotated_and_the_old_one_ends(store: Store) -> None:
     found = Tokens(store, clock=lambda: now)
     text, row = found.create("feeder", ["ingest"], fleet="a-", days=10)
     new, fresh, ends = found.rotate(row.id, hours=1)
+    with store.read() as connection:
+        deed = audit.entries(connection, 1)[0]
+    assert (deed.action, deed.target, deed.detail and deed.detail["before"]) == ("rotate token", fresh.id, row.id)
     assert ends == now + 3600 * 10**9
     assert found.actor(text) and found.actor(new).scopes == {"ingest"}
     assert (fresh.name, fresh.fleet, fresh.expires_ns) == ("feeder", "a-", now + 10 * DAY)
@@ -473,6 +477,23 @@ def test_deeds_are_written_down(client: TestClient, core: Core) -> None:
     ]
     answer = client.get("/audit?limit=1", headers=bearer(text)).json()
     assert (answer[0]["target"], answer[0]["actor"]) == (job, "anna")
+
+
+def test_what_is_not_stored_is_not_written_down_and_the_other_way_round(
+    client: TestClient, core: Core, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One transaction: a store that is locked between the two would leave a deed that nobody did."""
+    before = client.get("/audit").json()
+
+    def locked(*_: Any) -> None:
+        raise OperationalError("INSERT", {}, Exception("database is locked"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sprung.service.store.audit.record", locked)
+        answer = client.post("/recordings", files={"file": ("a.mcap", b"x")})
+        assert answer.status_code == 503 and answer.headers["retry-after"]
+    assert client.get("/jobs").json()["jobs"] == [] and list(core.settings.uploads.iterdir()) == []
+    assert client.get("/audit").json() == before
 
 
 def test_a_profile_names_the_threads(client: TestClient) -> None:

@@ -172,7 +172,7 @@ def test_scopes_of_one_fleet_never_count_for_another(provider: FakeProvider, tmp
 def test_a_provider_that_is_away_is_reported_and_nobody_gets_in(client: TestClient, provider: FakeProvider) -> None:
     provider.broken = True
     answer = client.get("/signin/oidc")
-    assert answer.status_code == 503 and "cannot be reached" in answer.text
+    assert answer.status_code == 503 and "cannot be reached" in answer.text and answer.headers["retry-after"]
     answer = client.get("/vehicles", headers={"authorization": f"Bearer {provider.token()}"})
     assert answer.status_code == 503 and answer.headers["retry-after"]
     assert len(provider.asked) == 1  # who makes up tokens does not wait for it each time, and holds nobody up

@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx2
 import jsonschema
@@ -15,6 +16,7 @@ import pytest
 from fastapi.testclient import TestClient
 from mcap.reader import make_reader
 from sqlalchemy import String, Text, select
+from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import System, parse_system
 from sprung.service.api import signals
@@ -100,6 +102,27 @@ def test_the_same_key_does_the_same_thing_once(client: TestClient, broken: str) 
     jobs = [client.post("/recordings", files=files, headers={"Idempotency-Key": "k2"}).json()["id"] for _ in "ab"]
     assert jobs[0] == jobs[1]
     assert len(client.get("/jobs").json()["jobs"]) == 1
+
+
+def test_what_is_done_is_answered_so_also_where_the_answer_cannot_be_kept(
+    client: TestClient, broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error would have the client send it again, and it would be done twice."""
+
+    def locked(*_: Any) -> None:
+        raise OperationalError("INSERT", {}, Exception("database is locked"))
+
+    monkeypatch.setattr("sprung.service.api.idempotency.insert_or_ignore", locked)
+    answer = client.post("/vehicles/a/notes", json={"text": "seen"}, headers={"Idempotency-Key": "k1"})
+    assert answer.status_code == 201
+    assert len(client.get("/vehicles/a/marks").json()["marks"]) == 1
+
+
+@pytest.mark.parametrize("deed", ["notes", "maintenance"])
+def test_a_mark_of_the_future_is_refused(client: TestClient, broken: str, deed: str) -> None:
+    answer = client.post(f"/vehicles/a/{deed}", json={"text": "seen", "time": "2199-01-01T00:00:00Z"})
+    assert answer.status_code == 422 and answer.json()["errors"] == [{"field": "time", "detail": "is in the future"}]
+    assert client.get("/vehicles/a/marks").json()["marks"] == []
 
 
 def test_a_key_outlives_a_leap_of_the_hosts_clock_also_while_the_service_is_stopped(

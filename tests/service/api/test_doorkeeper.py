@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from prometheus_client import CollectorRegistry
 
 from sprung.service.api import doorkeeper as module
 from sprung.service.api.clients import client_of
 from sprung.service.api.doorkeeper import Doorkeeper
+from sprung.service.observability.connections import ConnectionCollector
 from sprung.service.settings import Settings
 
 
@@ -58,7 +60,7 @@ def test_nobody_takes_places_of_others_that_hold_no_more(tmp_path: Path) -> None
     for k in range(12):
         assert door.admit(Held("ab"[k % 2]))
     assert not door.admit(Held("a")), "six each, and one more of the same"
-    assert door.refused == 1
+    assert door.closed[module.NO_ROOM] == 1
     assert door.admit(Held("c"))
 
 
@@ -125,3 +127,27 @@ def test_who_was_closed_for_others_has_broken_nothing_off(tmp_path: Path) -> Non
     for one in held[:-1]:
         door.broke_off(one)
     assert door.admit(Held("a"))
+
+
+def test_what_is_closed_is_counted_by_cause_and_shown(tmp_path: Path) -> None:
+    door = keeper(tmp_path, connections=2, each=2)
+    door.admit(Held("b"))
+    door.admit(Held("b", waiting=True))
+    assert door.admit(Held("a")), "one of two of the same"
+    assert not door.admit(Held("c"))
+    for _ in range(200):
+        door.broke_off(next(iter(door._open)))
+    assert not door.admit(Held("b"))
+    registry = CollectorRegistry()
+    registry.register(ConnectionCollector(lambda: len(door), lambda: door.closed))
+    assert registry.get_sample_value("sprung_connections") == 2
+    found = {
+        cause: registry.get_sample_value("sprung_connections_closed_total", {"cause": cause}) for cause in module.CAUSES
+    }
+    assert found == {
+        module.NO_ROOM: 1,
+        module.BROKEN_OFF: 1,
+        module.GIVEN_UP: 1,
+        module.TOO_SLOW: 0,
+        module.UNREAD: 0,
+    }

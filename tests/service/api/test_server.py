@@ -181,8 +181,12 @@ def test_a_key_flood_is_not_looked_at(engine: Engine) -> None:
         read_window(json.dumps({str(i): i for i in range(100_000)}).encode(), engine.form)
 
 
-@pytest.mark.parametrize("start", ["2200-01-01T00:00:00Z", "2399-01-01T00:00:00Z"])
-def test_a_window_of_the_future_is_refused_before_it_is_identified(client: TestClient, body: Any, start: str) -> None:
+@pytest.mark.parametrize(
+    "start", ["1970-01-01T00:01:00Z", "1999-12-31T00:00:00Z", "2200-01-01T00:00:00Z", "2399-01-01T00:00:00Z"]
+)
+def test_a_window_of_the_future_or_of_a_clock_that_was_not_set_is_refused_before_it_is_identified(
+    client: TestClient, body: Any, start: str
+) -> None:
     response = client.post("/identify?track=true", json=body | {"start": start})
     assert response.status_code == 422
     assert response.json()["errors"][0]["field"] == "start"
@@ -229,7 +233,8 @@ def nothing_left(core: Core) -> bool:
 
 @pytest.mark.parametrize("path", ["/recordings", "/diagnose"])
 def test_an_upload_past_the_quota_is_507_and_leaves_nothing(client: TestClient, core: Core, path: str) -> None:
-    assert client.post(path, files={"file": ("a.mcap", b"x" * 60_000)}).status_code == 507
+    answer = client.post(path, files={"file": ("a.mcap", b"x" * 60_000)})
+    assert answer.status_code == 507 and answer.headers["retry-after"]
 
     def unstated() -> Iterator[bytes]:
         yield b'--b\r\nContent-Disposition: form-data; name="file"; filename="a.mcap"\r\n\r\n'
