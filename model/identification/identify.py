@@ -125,10 +125,11 @@ class Identifier:
         self._allow(windows)
         faults = [tuple(f for f in its if f.kind in SOUGHT) for its in known] or [()] * len(windows)
         explainer, whole = self._explainer(windows.shape[1]), np.empty(len(windows), dtype=object)
-        points, estimating = explainer.points(known, len(windows)), 0.0
-        for edge in np.unique(explainer.margin(points)):
-            rows = np.flatnonzero(explainer.margin(points) == edge)
-            right = explainer.corrected(windows[rows], points[rows]) if points[rows].any() else windows[rows]
+        corrections = explainer.corrections
+        points, estimating = corrections.points(known, len(windows)), 0.0
+        for edge in np.unique(corrections.margin(points)):
+            rows = np.flatnonzero(corrections.margin(points) == edge)
+            right = corrections.corrected(windows[rows], points[rows]) if points[rows].any() else windows[rows]
             started = time.perf_counter()
             its_start = self._start(right, None if start is None else start[rows], loads=bool(self.system.loads))
             estimating += time.perf_counter() - started
@@ -280,7 +281,7 @@ class Identifier:
         """Whether a window should be explained: it does not fit, or fits better elsewhere by far."""
         found = estimate.deviating
         if estimate.adequate and found is not None and found.whole:
-            return explainer.apart(found.score, found.information)
+            return explainer.steps.apart(found.score, found.information)
         return not estimate.adequate
 
     def _averaged(self, estimate: Estimate) -> Estimate:

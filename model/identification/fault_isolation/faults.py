@@ -17,14 +17,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.interpolate import make_interp_spline
 
 from sprung.model.identification.fault_isolation.contradictions import Contradictions, Rearrangement, rearrangements
+from sprung.model.identification.fault_isolation.corrections import MARGIN, Corrections
+from sprung.model.identification.fault_isolation.steps import EVIDENT, DeviationSteps
 from sprung.model.identification.fault_isolation.stuck import STUCK, StuckChannels
 from sprung.model.identification.likelihood.gauss_newton import WindowBatch
 from sprung.model.identification.likelihood.linearise import as_rows
-from sprung.model.identification.measurements.deviations import clock_groups, named, shared_directions
+from sprung.model.identification.measurements.deviations import clock_groups
 from sprung.model.identification.refinement.any_inputs import RefinerOfAnyInputs
+from sprung.model.identification.refinement.nominal import nominal_cost
 from sprung.model.identification.refinement.refine import Refined
 from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
 from sprung.model.system import System
@@ -33,13 +35,8 @@ FIT_SIGMAS = 6.0  # chi-square further than this above its expectation: the wind
 ROUNDS = 5  # corrections of one window at most
 ITERATIONS = 6  # of a refinement that is tried
 TRIED = 8  # windows of a batch; when none of them can be explained, the others are not tried
-_FAR = (0.03, 1e-3, 0.03)  # gain, delay (s), load: beyond, a window is refined there rather than extrapolated
-_EVIDENT = 12.5  # log-likelihood ratio of such a step: five standard deviations
 _BETTER = 0.8  # of chi-square: by chance one number takes a few of its thousand, so that less than this is no chance
-_DEAF = 0.9  # away from 1: a channel whose gain is nearly none shows noise, and its gain could be anything
-_MARGIN = 2  # samples that a delay costs at either end beyond itself
 _LATE = (-0.045, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.045)  # s: delays too large for a linear step
-_SET_ANEW = 0.2  # of a window: what is left of it, once a delay is taken back from both ends, still tells
 _FAR_TRIED = 2  # windows of a batch, as many as it takes to have something in common
 _APART = 0.015  # s between delays that are tried: half a period of what moves at 30 Hz
 _LATE_TRIED = 3  # windows of a batch that they are tried on; others begin with what these have in common
@@ -85,33 +82,20 @@ class Explainer:
     ) -> None:
         """refiner: of windows of so many samples; start: from windows (B, T, C) to log-ratios to refine from."""
         self.system, self.samples, self.start, self.refiner = system, samples, start, refiner
-        deviations = refiner(samples).calibration.deviations
-        self.deviations = deviations
+        calibration = refiner(samples).calibration
+        self.corrections = Corrections(system, samples, calibration.deviations)
+        self.steps = DeviationSteps(system, self.corrections)
         self.channels = len(system.channels)
         self.names = [channel.name for channel in system.channels]
-        self.groups = clock_groups(system)
         units = [channel.unit for channel in system.channels]
-        alike = [(int(group), unit) for group, unit in zip(self.groups, units, strict=True)]
-        self.contradictions = Contradictions(refiner(samples).calibration, _numbers(units))
+        alike = [(int(group), unit) for group, unit in zip(clock_groups(system), units, strict=True)]
+        self.contradictions = Contradictions(calibration, _numbers(units))
         # Tried where nothing contradicts: of one clock, and of inputs, whose supports may be measured but once
         wide = rearrangements(_numbers(units))
         near = set(rearrangements(_numbers(alike)))
         self._rearrangements = [r for r in wide if r in near or max(r.columns) < len(system.inputs)]
         self.stuck = StuckChannels(system)
         self._along = bool(system.loads or system.built)  # whether these are refined with the parameters
-        self.directions = self._directions()
-        self._std = np.array([d.std for d in deviations])
-        self._measured = np.arange(len(deviations)) < 2 * self.channels
-        late = self.directions[:, self.channels : 2 * self.channels]
-        whole = [(late[:, self.groups == group] > 0).all(axis=1) for group in np.unique(self.groups)]
-        alone = (late > 0).sum(axis=1) == np.array([[np.sum(self.groups == g)] for g in np.unique(self.groups)])
-        self._clocks = self.directions[(np.array(whole) & alone).any(axis=0)]  # one delay for each clock
-        parts = [(late[:, self.groups == group] > 0).any(axis=1) for group in np.unique(self.groups)]
-        self._of_clocks = self.directions[(late > 0).any(axis=1) & (np.array(whole) == np.array(parts)).all(axis=0)]
-
-    def _directions(self) -> FloatArray:
-        """Simple explanations as rows over the deviations: each alone, and what several channels have in common."""
-        return np.concatenate([np.eye(len(self.deviations)), shared_directions(self.deviations)])
 
     def again(
         self, windows: FloatArray, known: Mapping[int, tuple[MeasurementFault, ...]]
@@ -185,7 +169,7 @@ class Explainer:
         Where several fit equally well, one fault of all their channels, and the windows are refined without these.
         """
         costs = self._costs(windows[:TRIED], candidates)
-        likely = [c for c, cost in zip(candidates, costs, strict=True) if cost < costs.min() + 2 * _EVIDENT]
+        likely = [c for c, cost in zip(candidates, costs, strict=True) if cost < costs.min() + 2 * EVIDENT]
         faults = [c.fault(self.names) for c in likely]
         if len(likely) > 1:
             channels = dict.fromkeys(channel for fault in faults for channel in fault.channel.split("|"))
@@ -236,14 +220,14 @@ class Explainer:
         plain = [e for e in found.values() if self._key(e.point)]
         if len(plain) < 2:
             return None
-        total = np.zeros((len(self._std), len(self._std)))
+        total = np.zeros((len(self.steps.std), len(self.steps.std)))
         pull = np.zeros(len(total))
         for e in plain:
             information = e.refined.information[0]
             total += information
-            pull += e.refined.score[0] + information @ np.where(self._measured, e.point, 0.0)
-        point = np.where(self._measured, self._most_likely(pull, total), 0.0)
-        return np.where(np.abs(point) > _SLIGHT * self._std, point, 0.0)
+            pull += e.refined.score[0] + information @ np.where(self.corrections.measured, e.point, 0.0)
+        point = np.where(self.corrections.measured, self.steps.most_likely(pull, total), 0.0)
+        return np.where(np.abs(point) > _SLIGHT * self.steps.std, point, 0.0)
 
     def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, FaultExplanation]:
         stuck = [self.stuck.channels(window) for window in windows]
@@ -253,12 +237,12 @@ class Explainer:
         plain = np.array([i for i, faults in enumerate(stuck) if not faults and i not in found], dtype=np.int64)
         found |= {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
         left = np.array([i for i in plain if i not in found], dtype=np.int64)
-        if len(left) and len(self._clocks) > 1:
-            again = self._by_steps(windows[left], [()] * len(left), step=self._clock_step)
+        if len(left) and len(self.steps.clocks) > 1:
+            again = self._by_steps(windows[left], [()] * len(left), step=self.steps.of_clocks)
             found |= {int(left[i]): e for i, e in again.items()}
             left = np.array([i for i in left if i not in found], dtype=np.int64)
         if len(left):
-            again = self._by_steps(windows[left], [()] * len(left), step=self._step_of_all)
+            again = self._by_steps(windows[left], [()] * len(left), step=self.steps.of_all)
             found |= {int(left[i]): self._within_tolerance(e) for i, e in again.items()}
         still = [i for i, faults in enumerate(stuck) if faults]
         found |= dict(zip(still, self._without(windows[still], [stuck[i] for i in still]), strict=True))
@@ -283,7 +267,7 @@ class Explainer:
         """One deviation at a time, the one with the most evidence, or what `step` makes of score and information;
         `known`: faults that were corrected before."""
         found: dict[int, FaultExplanation] = {}
-        active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.deviations)))
+        active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.corrections.deviations)))
         if start is not None:
             point[:, : 2 * self.channels] = start[: 2 * self.channels]
         before = np.full(len(windows), np.inf)
@@ -293,16 +277,16 @@ class Explainer:
             going = []
             for i, one in zip(active, parts, strict=True):
                 chi_square, weight = float(one.chi_square[0]), (one.score[0], one.information[0])
-                further = self._step(*weight)[0] if step is None else step(*weight)
+                further = self.steps.strongest(*weight)[0] if step is None else step(*weight)
                 good = bool(fits(one)[0])
                 if good:
                     found[int(i)] = FaultExplanation(
-                        one, self._with_load(point[i], one), (*known[i], *self._named(point[i]))
+                        one, self._with_load(point[i], one), (*known[i], *self.corrections.named(point[i]))
                     )
-                if self.apart(*weight) if good else chi_square < _BETTER * before[i]:
+                if self.steps.apart(*weight) if good else chi_square < _BETTER * before[i]:
                     before[i] = chi_square
-                    point[i] = self._moved(point[i], further)
-                    if self._credible(point[i]):
+                    point[i] = self.corrections.moved(point[i], further)
+                    if self.corrections.credible(point[i]):
                         going.append(i)
             active = np.array(going, dtype=np.int64)
             if len(active) == 0:
@@ -311,13 +295,13 @@ class Explainer:
 
     def _refined(self, windows: FloatArray, point: FloatArray, loads: BoolArray) -> list[Refined]:
         """Corrected windows refined, with their evidence; one `Refined` of one window each."""
-        margin = self.margin(point)
+        margin = self.corrections.margin(point)
         alike = np.unique(np.column_stack([margin, loads]).astype(np.int64), axis=0, return_inverse=True)[1]
         out: list[Refined | None] = [None] * len(windows)
         for group in np.unique(alike):
             rows = np.flatnonzero(alike == group)
             edge, with_loads = int(margin[rows[0]]), bool(loads[rows[0]])
-            restored = self.corrected(windows[rows], point[rows])
+            restored = self.corrections.corrected(windows[rows], point[rows])
             inner = restored[:, edge : self.samples - edge]
             refined = self.refiner(inner.shape[1]).refine(
                 inner,
@@ -330,28 +314,6 @@ class Explainer:
             for k, row in enumerate(rows):
                 out[row] = refined.take(np.array([k]))
         return [one for one in out if one is not None]
-
-    def points(self, known: Sequence[tuple[MeasurementFault, ...]], windows: int) -> FloatArray:
-        """The gains and delays among what is known of each of some windows as deviations, (B, H)."""
-        C, points = self.channels, np.zeros((windows, len(self.deviations)))
-        made: dict[tuple[MeasurementFault, ...], FloatArray] = {}
-        for b, faults in enumerate(known):
-            if faults not in made:
-                made[faults] = np.zeros(len(self.deviations))
-                for fault in faults:
-                    columns = [self.names.index(name) for name in fault.channel.split("|")]
-                    if fault.kind == "gain":
-                        made[faults][columns] = fault.value - 1
-                    elif fault.kind == "delay":
-                        made[faults][C + np.array(columns)] = fault.value
-            points[b] = made[faults]
-        return points
-
-    def margin(self, point: FloatArray) -> IntArray:
-        """Samples at either end that delays taken back (B, H) leave nothing right of, (B,)."""
-        C = self.channels
-        late = np.abs(point[:, C : 2 * C]).max(axis=1, initial=0.0) * self.system.sample_rate
-        return np.where(late > 0, np.ceil(late).astype(np.int64) + _MARGIN, 0)
 
     def together(self, before: FloatArray, cause: FaultExplanation) -> FaultExplanation:
         """The explanation of a window from which the deviations `before` (H,) had been taken back already."""
@@ -367,77 +329,16 @@ class Explainer:
         point[:C] = (1 + before[:C]) * (1 + point[:C]) - 1
         point[C : 2 * C] += before[C : 2 * C]
         hard = [f for f in cause.faults if f.kind not in ("gain", "delay")]
-        return replace(cause, point=point, faults=(*hard, *self._named(np.where(more & self._measured, point, 0.0))))
-
-    def corrected(self, windows: FloatArray, point: FloatArray) -> FloatArray:
-        """Windows (B, T, C) with gains divided out and delays taken back; at the ends a delay leaves nothing right."""
-        C = self.channels
-        out = windows / (1 + point[:, None, :C])
-        time = np.arange(windows.shape[1]) / self.system.sample_rate
-        for c in np.flatnonzero(point[:, C : 2 * C].any(axis=0)).tolist():
-            late = point[:, C + c]
-            whole = np.isfinite(out[:, :, c]).all(axis=1) & (np.ptp(out[:, :, c], axis=1) > 0)  # frozen ones stay so
-            for size in np.unique(late[whole & (late != 0)]):
-                rows = np.flatnonzero(whole & (late == size))
-                at = np.clip(time + size, 0, time[-1])
-                out[rows, :, c] = make_interp_spline(time, out[rows, :, c].T, k=7)(at).T
-        return np.asarray(out)
-
-    def _step(self, score: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
-        """The simple deviation with the most evidence at its most likely size, shape (H,), and that evidence."""
-        V = self.directions
-        slope = V @ score
-        curvature = ((V @ information) * V).sum(axis=1).clip(1e-12)
-        best = int(np.argmax(slope**2 / curvature))
-        return np.asarray(V[best] * slope[best] / curvature[best]), float(slope[best] ** 2 / curvature[best] / 2)
-
-    def _clock_step(self, score: FloatArray, information: FloatArray) -> FloatArray:
-        """The delays of all clocks at their most likely sizes, shape (H,)."""
-        V = self._clocks
-        w = (V * self._std).max(axis=1)
-        precision = np.eye(len(w)) + V @ information @ V.T * np.outer(w, w)
-        return np.asarray(V.T @ (w * np.linalg.solve(precision, w * (V @ score))))
-
-    def _step_of_all(self, score: FloatArray, information: FloatArray) -> FloatArray:
-        """All gains and delays at their most likely sizes within what data sheets leave open, shape (H,)."""
-        try:
-            return np.where(self._measured, self._most_likely(score, information), 0.0)
-        except np.linalg.LinAlgError:  # of a window whose motion has run away under a law
-            return np.zeros(len(score))
-
-    def _most_likely(self, score: FloatArray, information: FloatArray) -> FloatArray:
-        """Deviations (H,) at their most likely sizes within what data sheets leave open, which may be nothing."""
-        S = self._std
-        precision = np.eye(len(S)) + information * np.outer(S, S)
-        return np.asarray(S * np.linalg.solve(precision, S * score))
+        return replace(
+            cause,
+            point=point,
+            faults=(*hard, *self.corrections.named(np.where(more & self.corrections.measured, point, 0.0))),
+        )
 
     def _within_tolerance(self, cause: FaultExplanation) -> FaultExplanation:
         """An explanation by all gains and delays together; only what no data sheet leaves open is a fault."""
-        far = self._measured & (np.abs(cause.point) > _TOLERATED * self._std)
-        return replace(cause, faults=self._named(np.where(far, cause.point, 0.0)))
-
-    def apart(self, score: FloatArray, information: FloatArray) -> bool:
-        """Whether a window that fits should be refined elsewhere: it speaks clearly for a sizeable deviation."""
-        step, evidence = self._step(score, information)
-        C = self.channels
-        scale = np.concatenate([np.full(C, _FAR[0]), np.full(C, _FAR[1]), np.full(len(step) - 2 * C, _FAR[2])])
-        return bool(evidence > _EVIDENT and np.max(np.abs(step) / scale) > 1)
-
-    def _moved(self, point: FloatArray, step: FloatArray) -> FloatArray:
-        C = self.channels
-        out = point + step
-        out[:C] = (1 + point[:C]) * (1 + step[:C]) - 1
-        return out
-
-    def _credible(self, point: FloatArray) -> bool:
-        """Whether gains and delays are such as a window can still tell."""
-        gains, delays = np.abs(point[: 2 * self.channels]).reshape(2, -1)
-        return bool(gains.max() < _DEAF and delays.max() < self._longest)
-
-    @property
-    def _longest(self) -> float:
-        """s, of delays that are taken back."""
-        return _SET_ANEW * self.samples / self.system.sample_rate
+        far = self.corrections.measured & (np.abs(cause.point) > _TOLERATED * self.steps.std)
+        return replace(cause, faults=self.corrections.named(np.where(far, cause.point, 0.0)))
 
     def _with_load(self, point: FloatArray, one: Refined) -> FloatArray:
         """The loads that were refined along are part of where the window was linearised."""
@@ -445,9 +346,6 @@ class Explainer:
         out = point.copy()
         out[2 * self.channels :] = one.log_ratio[0, P:] if one.log_ratio.shape[1] > P else 0.0
         return out
-
-    def _named(self, point: FloatArray) -> tuple[MeasurementFault, ...]:
-        return named(self.deviations, point, np.zeros(len(point)), np.abs(point) > 0)
 
     def _without(self, windows: FloatArray, faults: Sequence[tuple[MeasurementFault, ...]]) -> list[FaultExplanation]:
         """Windows (B, T, C) without the channels that the faults of each name."""
@@ -475,7 +373,7 @@ class Explainer:
         """Explanations of windows (B, T, C), by index; for those without one, what is wrong though it is not
         corrected."""
         left = [b for b in range(len(windows)) if b not in explained]
-        point = np.zeros((len(left), len(self.deviations)))
+        point = np.zeros((len(left), len(self.corrections.deviations)))
         refined = self._refined(windows[left], point, np.zeros(len(left), dtype=bool))
         as_they_are = {
             b: FaultExplanation(one, at, faults[b], False) for b, one, at in zip(left, refined, point, strict=True)
@@ -496,24 +394,25 @@ class Explainer:
         far: clocks by very many, too.
         """
         C = self.channels
-        found = self._late_by(window, self.directions[self.directions[:, C : 2 * C].any(axis=1)], _LATE)
-        return found if found is not None or not far else self._late_by(window, self._of_clocks, self._far)
+        found = self._late_by(window, self.steps.directions[self.steps.directions[:, C : 2 * C].any(axis=1)], _LATE)
+        return found if found is not None or not far else self._late_by(window, self.steps.late_clocks, self._far)
 
     @property
     def _far(self) -> tuple[float, ...]:
         """Delays, s, of a clock that was set anew: beyond those that electronics and filters have."""
-        later = np.arange(max(_LATE) + _APART, self._longest, _APART)
+        later = np.arange(max(_LATE) + _APART, self.corrections.longest, _APART)
         return (*-later[::-1], *later)
 
     def _late_by(self, window: FloatArray, rows: FloatArray, lates: Sequence[float]) -> FaultExplanation | None:
         """One window (T, C) with channels, of `rows` over the deviations, that are late by one of `lates`, s, put
         right."""
-        points = np.array([np.zeros(len(self.deviations)), *(row * late for row in rows for late in lates)])
-        edge = int(np.ceil(max(lates, default=0.0) * self.system.sample_rate)) + _MARGIN
+        points = np.array([np.zeros(len(self.corrections.deviations)), *(row * late for row in rows for late in lates)])
+        edge = int(np.ceil(max(lates, default=0.0) * self.system.sample_rate)) + MARGIN
         if self.samples <= 4 * edge or len(points) == 1:
             return None
-        restored = self.corrected(np.repeat(window[None], len(points), axis=0), points)
-        costs = self._nominal_cost(restored[:, edge : self.samples - edge])
+        restored = self.corrections.corrected(np.repeat(window[None], len(points), axis=0), points)
+        inner = restored[:, edge : self.samples - edge]
+        costs = nominal_cost(self.refiner(inner.shape[1]), inner)
         for at in np.argsort(costs[1:])[:_TRIALS] + 1:
             if costs[at] < _BETTER * costs[0]:
                 explained = self._by_steps(window[None], [()], points[at])
@@ -524,7 +423,8 @@ class Explainer:
     def _reversed(self, window: FloatArray) -> list[tuple[FloatArray, MeasurementFault]]:
         """Windows with one sign turned or two channels exchanged that fit better at nominal values, the best first."""
         tries = [(one.undone(window), one.fault(self.names)) for one in self._rearrangements]
-        costs = self._nominal_cost(np.array([window, *(restored for restored, _ in tries)]))
+        restored = np.array([window, *(one for one, _ in tries)])
+        costs = nominal_cost(self.refiner(self.samples), restored)
         order = np.argsort(costs[1:])
         return [tries[i] for i in order[:_TRIALS] if costs[1 + i] < _BETTER * costs[0]]
 

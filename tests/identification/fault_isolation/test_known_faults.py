@@ -10,7 +10,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.fault_isolation.faults import Explainer
+from sprung.model.identification.fault_isolation.steps import DeviationSteps
 from sprung.model.identification.identify import Identifier
 from sprung.model.identification.measurements.deviations import deviations
 from sprung.model.identification.refinement.refine import Refiner
@@ -205,7 +205,7 @@ def test_channels_that_are_all_off_within_their_data_sheets_leave_windows_that_f
     """3 % each is more than a window bears that fits only with all of them, and no fault of any one."""
     gains = 1 + 0.03 * np.random.default_rng(5).choice([-1.0, 1.0], 28)
     values, identifier = windows(system, samples * gains, hop=100)[:4], Identifier(system)
-    with patch.object(Explainer, "_step_of_all", lambda self, score, information: 0 * score):
+    with patch.object(DeviationSteps, "of_all", lambda self, score, information: 0 * score):
         before = identifier.examine(values, np.ones(4, dtype=bool))
     after = identifier.examine(values, np.ones(4, dtype=bool))
     assert sum(e.adequate for e in before) < 4
