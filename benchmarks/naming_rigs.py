@@ -138,6 +138,13 @@ def _valve(random: np.random.Generator) -> SimulatedRig:
     )
 
 
+def _fluid(random: np.random.Generator) -> SimulatedRig:
+    """A damper whose orifices make its force grow with a power of the rate."""
+    force, exponent = random.uniform(500, 2000), random.uniform(0.25, 0.6)  # N at 1 m/s
+    truth = {"force_at_0.1_m/s": force * 0.1**exponent, "exponent": exponent}
+    return SimulatedRig(lambda x, v, h: force * math.copysign(abs(v) ** exponent, v), truth)
+
+
 def _stopped(gap: float, hard: float, gap_compression: float, hard_compression: float, power: float) -> Stepped:
     """Stops on both sides; a stiffness is the force over the depth, a gap's length deep."""
 
@@ -310,4 +317,5 @@ RIGS: dict[str, RigKind] = {
     "spring off centre": RigKind(frozenset({"cubic_stiffness"}), _off_centre),
     "smooth spring": RigKind(frozenset(), _smooth),
     "softening to one side": RigKind(frozenset(), _softening),
+    "fluid damper": RigKind(frozenset({"power_law_damping"}), _fluid),
 }

@@ -27,6 +27,7 @@ from sprung.model.laws.damping import (
     COULOMB_FRICTION,
     DAMPER_ASYMMETRY,
     DAMPER_BLOWOFF,
+    POWER_LAW_DAMPING,
     QUADRATIC_DAMPING,
 )
 from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
@@ -75,6 +76,7 @@ CATALOGUE: tuple[Law, ...] = (
     PINCHED_HYSTERESIS,
     FRICTION_BACKLASH,
     GAS_SPRING,
+    POWER_LAW_DAMPING,
     PRELOAD,
     AIR_SPRING,
     FRACTIONAL_STIFFNESS,

@@ -1,4 +1,4 @@
-"""Dampers that are not linear: dry friction, blow-off, asymmetry, quadratic damping."""
+"""Dampers that are not linear: dry friction, blow-off, asymmetry, other powers of the rate."""
 
 from __future__ import annotations
 
@@ -253,4 +253,45 @@ QUADRATIC_DAMPING = ElementLaw(
     looks_like="damping grows with the rate, smoothly",
     confused_with=("damper_blowoff", "coulomb_friction"),
     sentence="the damper has a force with the square of the rate, c2 = {c2}",
+)
+
+
+def _power(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    force, exponent, smoothing = p
+    found: FloatArray = force * motion.rate * (motion.rate**2 + smoothing**2) ** ((exponent - 1) / 2)
+    return found
+
+
+def _typical_at_unit_rate(seen: Observed) -> float:
+    """A force that matters at the rates seen, for an exponent of a half, N at 1 m/s."""
+    return 0.3 * seen.damping * float(np.sqrt(max(seen.rate_rms, 1e-12)))
+
+
+# Fluid through shaped orifices, as in dampers of buildings and bridges (Constantinou and Symans 1993)
+POWER_LAW_DAMPING = ElementLaw(
+    name="power_law_damping",
+    title="damping with a power of the rate",
+    parameters=(
+        ParameterSpec("force", "N", 0.0, 1e12, "force at 1 m/s", _typical_at_unit_rate),
+        ParameterSpec("exponent", "1", 0.1, 0.95, "of the rate: 1 is a linear damper", lambda seen: 0.5),
+        ParameterSpec(
+            "smoothing",
+            "m/s",
+            1e-6,
+            10.0,
+            "rate below which the force is linear",
+            lambda seen: 0.05 * seen.rate_rms,
+            log=True,
+            minor=True,
+        ),
+    ),
+    force=_power,
+    formula="force * v * (v ** 2 + smoothing ** 2) ** ((exponent - 1) / 2)",
+    shapes=lambda seen: grid([_typical_at_unit_rate(seen)], [0.2, 0.4, 0.7], [0.05 * seen.rate_rms]),
+    absent=(0.0, 1.0, 1.0),
+    looks_like="damping that grows ever more slowly with the rate, without a knee",
+    confused_with=("coulomb_friction", "damper_blowoff"),
+    sentence="the damper has a force of {force} at 1 m/s, with the rate to the power of {exponent}",
+    prior_cost=RARE,
+    screened=False,
 )

@@ -20,6 +20,7 @@ def tried(name: str, motion: str) -> dict[str, object]:
     [
         ("nothing", "sine"),
         ("stribeck", "quake"),
+        ("fluid damper", "random"),
         pytest.param("lugre", "sine", marks=pytest.mark.slow),
         pytest.param("friction_backlash", "sweep", marks=pytest.mark.slow),
     ],

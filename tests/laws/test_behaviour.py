@@ -1,5 +1,7 @@
 """What a law carries beside its force: branch, path, other starts, prior cost."""
 
+from math import gamma
+
 import numpy as np
 import pytest
 
@@ -94,6 +96,7 @@ def test_laws_that_contain_commoner_ones_must_beat_them() -> None:
     assert rare == {
         *("air_spring", "fractional_stiffness", "anti_roll_bar", "wheel_flat", "rail_joints"),
         *("stribeck", "dahl", "lugre", "pinched_hysteresis", "friction_backlash", "gas_spring", "progressive_stop"),
+        "power_law_damping",
         *("missing_connection", "suspended_mass", "structural_damping", "modal_damping", "inerter"),
     }
 
@@ -109,6 +112,19 @@ def test_laws_of_rigs_are_no_candidates_for_a_vehicle() -> None:
         "friction_backlash",
         "gas_spring",
         "progressive_stop",
+        "power_law_damping",
         "preload",
     }
     assert wider_law("bouc_wen").prior_cost == RARE
+
+
+@pytest.mark.parametrize("exponent", [0.2, 0.5, 0.9])
+def test_a_cycle_of_a_fluid_damper_takes_the_energy_of_a_power_of_the_rate(exponent: float) -> None:
+    """4 2^a Gamma(1 + a/2)^2 / Gamma(2 + a) times largest force times amplitude (Soong and Constantinou 1994)."""
+    phase = np.linspace(0, 2 * np.pi, 40_001)
+    amplitude, rate = 0.02, 0.02 * 2 * np.pi
+    d, v = amplitude * np.sin(phase), rate * np.cos(phase)
+    force = force_along(element_law("power_law_damping"), (3e3, exponent, 1e-6), d, v, phase, SpringDamper(4e5, 2e4))
+    energy = float(np.trapezoid(force, d))
+    share = 4 * 2**exponent * gamma(1 + exponent / 2) ** 2 / gamma(2 + exponent)
+    assert energy == pytest.approx(share * 3e3 * rate**exponent * amplitude, rel=1e-3)

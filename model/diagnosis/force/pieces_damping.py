@@ -13,8 +13,10 @@ from sprung.model.diagnosis.force.piece import (
     wider_form,
 )
 from sprung.model.laws import SpringDamper, grid
-from sprung.model.laws.damping import DAMPER_ASYMMETRY, DAMPER_BLOWOFF, QUADRATIC_DAMPING
+from sprung.model.laws.damping import DAMPER_ASYMMETRY, DAMPER_BLOWOFF, POWER_LAW_DAMPING, QUADRATIC_DAMPING
 from sprung.model.laws.hysteresis import AIR_SPRING, SERIES_STIFFNESS
+
+_EXPONENT = POWER_LAW_DAMPING.parameters[1]
 
 
 def _knee_limits(seen: MotionSizes) -> tuple[float, float]:
@@ -45,6 +47,18 @@ _QUADRATIC = Piece(
     (1,),
     lambda a, s, e: (a[0],),
     lambda p: (),
+    strengthened=True,
+)
+_POWER = Piece(
+    POWER_LAW_DAMPING,
+    ("exponent", "smoothing"),
+    lambda seen: grid([0.15, 0.3, 0.45, 0.6, 0.8], seen.rate_rms * np.array([0.005, 0.1])),
+    lambda seen: [(_EXPONENT.low, _EXPONENT.high), (1e-3 * seen.rate_rms, 0.5 * seen.rate_rms)],
+    (1,),
+    lambda a, s, e: (a[0], s[0], s[1]),
+    lambda p: (p[1], p[2]),
+    lambda a, s, e: {"force_at_0.1_m/s": (a[0] * 0.1 ** s[0], "N")},
+    believed=lambda fitted: _EXPONENT.low < fitted.shape[0] < _EXPONENT.high,
     strengthened=True,
 )
 _BLOWOFF = Piece(
@@ -103,4 +117,12 @@ _SERIES = Piece(
     acting_parameters=lambda a, s, e: (a[0], s[0]),
 )
 
-DAMPING_PIECES: tuple[Piece, ...] = (_QUADRATIC, _BLOWOFF, _TWO_KNEES, _ASYMMETRY, _ASYMMETRY_OF_VALVES, _SERIES)
+DAMPING_PIECES: tuple[Piece, ...] = (
+    _QUADRATIC,
+    _POWER,
+    _BLOWOFF,
+    _TWO_KNEES,
+    _ASYMMETRY,
+    _ASYMMETRY_OF_VALVES,
+    _SERIES,
+)
