@@ -41,6 +41,7 @@ ORDER = [
     "laws",
     "systemfile",
     "system",
+    "ratios",
     "identifier",
     "simulate",
     "ambient",

@@ -15,6 +15,7 @@ import numpy as np
 from sprung.model.ambient.sensing import Sensing
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, FORCE, VELOCITY, Mechanics
 from sprung.model.parameters import Parameter
+from sprung.model.ratios import parameter_powers
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -29,6 +30,9 @@ class Response:
     factor: np.ndarray  # force at each place per motion there and per log-ratio, shape (F, P, K)
 
 
+_DERIVATIVE = {"stiffness": 0, "damping": 1, "mass": 2}
+
+
 class Responses:
     """Responses of one system; the sources are all its supports (m), or forces (N) on all degrees of freedom."""
 
@@ -39,17 +43,13 @@ class Responses:
         self.sensing = sensing
         self.supported = m.G.shape[1] > 0
         self.unknowns = (*system.parameters, *(_load(system, body) for body in loads))
-        elements, bodies = list(system.elements), list(system.bodies)
-        E, n = m.H.shape
-        self.place = np.zeros((len(self.unknowns), E + n))  # elements and masses that an unknown scales
-        self.derivative = np.zeros(len(self.unknowns), dtype=int)  # 0: of motion, 1: of its rate, 2: of acceleration
-        for row, unknown in enumerate(self.unknowns):
-            if unknown.quantity == "mass":
-                self.place[row, E:] = m.body_of_dof == bodies.index(unknown.element)
-                self.derivative[row] = 2
-            else:
-                self.place[row, elements.index(unknown.element)] = 1.0
-                self.derivative[row] = unknown.quantity == "damping"
+        powers, none = parameter_powers(system), np.zeros(len(m.stiffness))
+        of_loads = [np.append(none, m.body_of_dof == system.bodies.index(body)) for body in loads]
+        of_parameters = np.concatenate([powers.stiffness + powers.damping, powers.mass], axis=1)
+        # Elements and masses that an unknown scales, (P + loads, E + n)
+        self.place = np.concatenate([of_parameters, *(row[None] for row in of_loads)])
+        # 0: of motion, 1: of its rate, 2: of acceleration
+        self.derivative = np.array([_DERIVATIVE.get(unknown.quantity, 0) for unknown in self.unknowns], dtype=int)
 
     def values(self, log_ratio: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Stiffnesses, dampings (E,) and masses (n,) of log-ratios (P,)."""

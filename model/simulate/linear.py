@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
+from sprung.model.ratios import parameter_powers
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import knots
 from sprung.model.simulate.loading import Loading
@@ -109,7 +110,7 @@ class LinearSimulator:
         self.W = 2 * (len(self.supports) + len(self.forces))
         self._assemble(constant)
         # Powers of the parameters: of stiffnesses (P, E), of dampings (P, E), of masses and inertias (P, n)
-        self.k_of, self.c_of, self.m_of = (constant(powers) for powers in _powers(system))
+        self.k_of, self.c_of, self.m_of = (constant(powers) for powers in parameter_powers(system))
         self.loading = Loading(system, constant)
         self.estimated_masses = int(self.m_of.any(dim=1).sum())
         self.estimates_mass = self.estimated_masses > 0
@@ -304,21 +305,3 @@ def _knot_of(system: System, drive: int) -> int:
             return 2 * i
         at += 1 if source.kind == "force" else 2
     raise AssertionError(drive)
-
-
-def _powers(system: System) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Powers of the parameters of which stiffnesses (P, E), dampings (P, E), masses and inertias (P, n) are made."""
-    mechanics, P = system.mechanics, len(system.parameters)
-    k, c = np.zeros((2, P, len(mechanics.stiffness)))
-    m = np.zeros((P, mechanics.n))
-    followers = {follower.parameter.name: follower for follower in system.followers}
-    for row, parameter in enumerate(system.parameters):
-        follower = followers.get(parameter.name)
-        if follower is not None and follower.element >= 0:
-            k[row, follower.element], c[row, follower.element] = follower.stiffness, follower.damping
-        elif follower is not None or parameter.quantity == "mass":
-            body = system.bodies.index(parameter.element) if follower is None else follower.body
-            m[row] = mechanics.body_of_dof == body
-        else:
-            (k if parameter.quantity == "stiffness" else c)[row, system.elements.index(parameter.element)] = 1.0
-    return k, c, m

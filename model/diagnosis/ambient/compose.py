@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from sprung.model.diagnosis.ambient.judgement import VARYING, AmbientJudgement, PooledValues
@@ -26,6 +24,7 @@ from sprung.model.diagnosis.rules import AmbientRules
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_STUCK
 from sprung.model.mechanics import Mode
+from sprung.model.ratios import mechanics_at
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -133,12 +132,7 @@ def _findings(
 
 def modes_at(system: System, log_ratio: FloatArray) -> list[Mode]:
     """Natural modes at given log-ratios, by frequency."""
-    values = {p.name: p.nominal * float(np.exp(x)) for p, x in zip(system.parameters, log_ratio, strict=True)}
-    mechanics = system.mechanics
-    stiffness = [values.get(f"{e}.stiffness", k) for e, k in zip(system.elements, mechanics.stiffness, strict=True)]
-    damping = [values.get(f"{e}.damping", c) for e, c in zip(system.elements, mechanics.damping, strict=True)]
-    changed = replace(mechanics, stiffness=np.array(stiffness), damping=np.array(damping))
-    modes = sorted(changed.modes(system.bodies), key=lambda mode: mode.frequency)
+    modes = sorted(mechanics_at(system, log_ratio).modes(system.bodies), key=lambda mode: mode.frequency)
     return [mode for mode in modes if mode.frequency > 1e-6 * modes[-1].frequency]
 
 

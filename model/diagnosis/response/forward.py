@@ -23,22 +23,14 @@ from sprung.model.diagnosis.response.terms import Term, branches_of, evaluated_i
 from sprung.model.laws import CLOCK_LEAD, SensorLaw, SensorResponse, SpringDamper, SupportLaw
 from sprung.model.laws.in_place import with_law
 from sprung.model.mechanics import VELOCITY, Mechanics
+from sprung.model.ratios import mechanics_at
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 
 def mechanics_of(system: System, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Mechanics:
     """Mechanics for log-ratios `theta` (P,) of the system's parameters, with laws of bodies and structure."""
-    mechanics = system.mechanics
-    mass, stiffness, damping = mechanics.mass.copy(), mechanics.stiffness.copy(), mechanics.damping.copy()
-    for parameter, log_ratio in zip(system.parameters, theta, strict=True):
-        ratio = np.exp(log_ratio)
-        if parameter.quantity == "mass":
-            mass[mechanics.body_of_dof == system.bodies.index(parameter.element)] *= ratio
-        else:
-            values = stiffness if parameter.quantity == "stiffness" else damping
-            values[system.elements.index(parameter.element)] *= ratio
-    mechanics = replace(mechanics, mass=mass, stiffness=stiffness, damping=damping)
+    mechanics = mechanics_at(system, theta)
     for term in terms:
         if term.law.load is None:  # else its force is added to the response
             mechanics = with_law(system.file, mechanics, term.law, term.location, term.parameters, term.variant)
