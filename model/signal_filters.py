@@ -51,15 +51,19 @@ def firwin(taps: int, cutoff: float, window: Any, rate: float = 2.0) -> FloatArr
     return found
 
 
-def kaiserord(attenuation: float, width: float) -> tuple[int, float]:
-    """Taps and shape of a Kaiser window; attenuation: dB, width: of the transition, in half the sample rate."""
-    taps, beta = _signal().kaiserord(attenuation, width)
-    return int(taps), float(beta)
+def low_pass(passed: float, stopped: float, attenuation: float, rate: float, multiple: int = 1) -> FloatArray:
+    """The taps (2 h + 1,) of a low-pass of linear phase behind a Kaiser window; h is a multiple of `multiple`.
+
+    passed, stopped: edges of pass band and stop band, in the unit of `rate`, the sample rate; attenuation: dB.
+    """
+    taps, beta = _signal().kaiserord(attenuation, (stopped - passed) / (rate / 2))
+    half = -(-(int(taps) // 2 + 1) // multiple) * multiple
+    return firwin(2 * half + 1, (passed + stopped) / 2, ("kaiser", float(beta)), rate)
 
 
 def upfirdn(taps: FloatArray, series: FloatArray, up: int = 1, down: int = 1) -> FloatArray:
-    """A series at `up` times its rate through a filter, of which one sample of `down` is kept."""
-    found: FloatArray = _signal().upfirdn(taps, series, up, down)
+    """A series (T, ...) at `up` times its rate through a filter, of which one sample of `down` is kept."""
+    found: FloatArray = _signal().upfirdn(taps, series, up, down, axis=0)
     return found
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import median_filter
 
-from sprung.model.signal_filters import firwin, kaiserord, upfirdn
+from sprung.model.signal_filters import low_pass, upfirdn
 from sprung.model.signals import Channel, FloatArray, IntArray, SampleBlock
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.grid import SLOWEST
@@ -239,12 +239,9 @@ def _chosen(block: SampleBlock, which: np.ndarray) -> SampleBlock:
 
 
 @lru_cache(maxsize=16)
-def low_pass(up: int, down: int, own_over_grid: float) -> FloatArray:
+def anti_alias_taps(up: int, down: int, own_over_grid: float) -> FloatArray:
     """The taps at `up` times a channel's own rate, an odd number of them, centred; their half a multiple of `down`."""
-    rate = up * own_over_grid  # in grid rates
-    length, beta = kaiserord(ATTENUATION, (STOP - PASS) / (rate / 2))
-    half = -(-(length // 2 + 1) // down) * down
-    taps = firwin(2 * half + 1, (PASS + STOP) / 2, window=("kaiser", beta), rate=rate)
+    taps = low_pass(PASS, STOP, ATTENUATION, up * own_over_grid, multiple=down)  # in grid rates
     return np.asarray(taps * up, dtype=np.float64)
 
 
@@ -257,7 +254,7 @@ class Reducer:
         ratio = Fraction(period * sample_rate).limit_denominator(10_000)
         near = next((f for n in range(1, MOST_UP + 1) if (f := _near(period * sample_rate, n)) is not None), None)
         self.up, self.down = (near.numerator, near.denominator) if near else (1, int(1 / ratio))
-        self.taps = low_pass(self.up, self.down, float(f"{1 / (period * sample_rate):.6g}"))
+        self.taps = anti_alias_taps(self.up, self.down, float(f"{1 / (period * sample_rate):.6g}"))
         self.half = len(self.taps) // 2  # at `up` times the own rate
         self.reach = -(-self.half // self.up)  # own samples on either side of an output
         self.done = NEVER  # nothing before this time (ns) will come any more

@@ -12,7 +12,7 @@ from sprung.replay import UnreadableRecording
 from sprung.replay.account import Account
 from sprung.replay.multirate import MultirateColumns
 from sprung.replay.record import load_record
-from sprung.replay.sampling import at_rate, low_pass, sampling_clock
+from sprung.replay.sampling import anti_alias_taps, at_rate, sampling_clock
 from sprung.replay.windowing import Windower
 from tests.replay.test_record import CSV_CHANNELS, write_table
 
@@ -77,7 +77,7 @@ def test_fast_channels_keep_what_the_grid_can_hold_and_lose_what_would_alias(rat
 
 
 def test_the_filter_is_as_flat_and_as_steep_as_it_says() -> None:
-    taps = low_pass(1, 10, 10.0)
+    taps = anti_alias_taps(1, 10, 10.0)
     frequency = np.fft.rfftfreq(1 << 16) * 10.0  # in grid rates
     gain = np.abs(np.fft.rfft(taps, 1 << 16))
     assert np.abs(gain[frequency < 0.4] - 1).max() < 2e-4

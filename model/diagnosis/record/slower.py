@@ -8,10 +8,10 @@ the same for all signals, which preserves their linear relation.
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import firwin, kaiserord, upfirdn
 
 from sprung.model.diagnosis.rules import RecordRules
 from sprung.model.mechanics import DISPLACEMENT
+from sprung.model.signal_filters import low_pass, upfirdn
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -57,9 +57,8 @@ def slower(values: FloatArray, factor: int) -> tuple[FloatArray, int]:
 
     Transients of the filter at both ends are cut off; columns of NaN are kept.
     """
-    taps, beta = kaiserord(_DAMPED, (_STOP - _PASS) * 2 / factor)
-    half = taps // 2 + 1
-    low = firwin(2 * half + 1, (_PASS + _STOP) / 2, window=("kaiser", beta), fs=factor)
+    low = low_pass(_PASS, _STOP, _DAMPED, factor)
+    half = len(low) // 2
     first = -(-half // factor) * factor
-    filtered = upfirdn(low, values, down=1, axis=0)[half : half + len(values)]
+    filtered = upfirdn(low, values)[half : half + len(values)]
     return filtered[first : len(values) - half : factor], first
