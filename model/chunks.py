@@ -19,7 +19,7 @@ Result = TypeVar("Result")
 
 
 def chunks(of: IntArray) -> list[IntArray]:
-    """Indices in pieces of at most `CHUNK`, of nearly equal size."""
+    """Indices (N,) in pieces of at most `CHUNK`, of nearly equal size."""
     return [np.asarray(part) for part in np.array_split(of, max(1, -(-len(of) // CHUNK)))]
 
 

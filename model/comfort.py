@@ -60,7 +60,7 @@ W_B = Weighting(16.0, 0.55, 2.5, 0.9, 4.0, 0.95, 1.024)  # ISO 2631-4, EN 12299
 
 
 def running_band(omega: FloatArray) -> np.ndarray:
-    """Band-pass of EN 14363 for accelerations in the body, 24 dB per octave."""
+    """Band-pass of EN 14363 for accelerations in the body, 24 dB per octave, at angular frequencies (F,), rad/s."""
     low, high = BAND
     return analog_bandpass(4, 2 * np.pi * low, 2 * np.pi * high, omega)
 
@@ -206,7 +206,10 @@ def foreseen(system: System, log_ratio: FloatArray, speed: float = 40.0) -> Floa
 
 
 def cost(system: System, log_ratio: FloatArray, baseline: FloatArray, speed: float = 40.0) -> float | None:
-    """Relative change of the W_b-weighted rms, mean over the comfort sensors, that leaving the baseline has brought."""
+    """Relative change of the W_b-weighted rms, mean over the comfort sensors, that leaving the baseline has brought.
+
+    Both as log-ratios (P,); speed in m/s.
+    """
     now, then = (foreseen(system, values, speed) for values in (log_ratio, baseline))
     return float(np.mean(now) / np.mean(then) - 1) if len(now) else None
 

@@ -31,13 +31,13 @@ def lfilter(numerator: Coefficients, denominator: Coefficients, series: FloatArr
 def lfilter_from(
     numerator: Coefficients, denominator: Coefficients, series: FloatArray, state: Coefficients
 ) -> FloatArray:
-    """The same from a state of the filter, as `lfilter_zi` has it."""
+    """The same of a series (T,) from a state (order,) of the filter, as `lfilter_zi` has it."""
     found: FloatArray = _signal().lfilter(numerator, denominator, series, zi=state)[0]
     return found
 
 
 def lfilter_zi(numerator: Coefficients, denominator: Coefficients) -> FloatArray:
-    """The state of a filter that has seen ones for ever."""
+    """The state (order,) of a filter that has seen ones for ever."""
     found: FloatArray = _signal().lfilter_zi(numerator, denominator)
     return found
 
@@ -81,6 +81,6 @@ def analog_bandpass(order: int, low: float, high: float, omega: FloatArray) -> n
 
 
 def welch(series: FloatArray, **how: Any) -> tuple[FloatArray, FloatArray]:
-    """Frequencies and power spectral density of a series, as `scipy.signal.welch` has them."""
+    """Frequencies (F,) and power spectral density (F,) of a series (T,), as `scipy.signal.welch` has them."""
     found: tuple[FloatArray, FloatArray] = _signal().welch(series, **how)
     return found

@@ -108,7 +108,7 @@ def resample(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: i
 
 
 def uneven(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: int = 2) -> Resampled:
-    """One channel at the grid positions `rows` whose time stamps are those of its samples but fit no even clock.
+    """One channel (T,) at grid positions `rows` (R,) whose time stamps are those of its samples but fit no even clock.
 
     A cubic spline through the samples (not-a-knot ends) is read at even steps of their mean distance, or of a grid
     period where that is shorter, then resampled as an even channel.  Between samples that are further
@@ -163,7 +163,7 @@ def taken_at_stamps(offset: FloatArray, value: FloatArray) -> bool:
 
 
 def by_count(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: int = 2) -> Resampled | None:
-    """A channel of the grid's own rate whose time stamps are those of a late and bursty arrival; None when that is
+    """A channel (T,) of the grid's own rate whose stamps are those of a late and bursty arrival; None when that is
     not what it is.
 
     Such stamps are never early: taking one grid period off per sample leaves a constant plus the delay.  When its

@@ -126,7 +126,7 @@ def _collect(blocks: Any, channels: int, account: Account) -> tuple[list[IntArra
 
 
 def look(name: str, address: dict[str, str], unit: str | None, time: IntArray, value: FloatArray, first: int) -> Signal:
-    """One signal; time in ns, sorted."""
+    """One signal (T,); time in ns, sorted."""
     good = np.isfinite(value)
     signal = Signal(name, address, unit, len(value), int((~good).sum()))
     if not good.any():

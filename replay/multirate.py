@@ -30,7 +30,7 @@ class MultirateColumns:
 
 
 def slower_than(time: FloatArray, interval: float) -> bool:
-    """Whether samples come evenly, but less often than every `interval`, in the unit of their times."""
+    """Whether samples at times (T,) come evenly, but less often than every `interval`, in the unit of their times."""
     between = _intervals(np.sort(time))
     if len(between) < 0.1 * ROWS:
         return False

@@ -49,7 +49,7 @@ STANDS_OUT = 10.0  # median deviations of the other values by which a sentinel m
 
 
 def nanoseconds(seconds: FloatArray) -> tuple[IntArray, BoolArray]:
-    """Times in s as ns, and which of them are times at all; the others are 0."""
+    """Times (T,) in s as ns, and which of them are times at all; the others are 0."""
     with np.errstate(invalid="ignore", over="ignore"):
         scaled = np.round(seconds * 1e9)
         good = (scaled >= EARLIEST) & (scaled <= LATEST)  # False for NaN

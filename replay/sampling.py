@@ -46,7 +46,7 @@ class SamplingClock:
 
 
 def sampling_clock(time: IntArray) -> SamplingClock | None:
-    """The sampling clock of sorted times (ns), in the longest stretch without gaps; None with too few of them."""
+    """The sampling clock of sorted times (T,), ns, in the longest stretch without gaps; None with too few of them."""
     steps = np.diff(time).astype(np.float64) / 1e9
     if len(steps) < 3 or not steps.any():
         return None
@@ -240,7 +240,7 @@ def _chosen(block: SampleBlock, which: np.ndarray) -> SampleBlock:
 
 @lru_cache(maxsize=16)
 def anti_alias_taps(up: int, down: int, own_over_grid: float) -> FloatArray:
-    """The taps at `up` times a channel's own rate, an odd number of them, centred; their half a multiple of `down`."""
+    """The taps (2 h + 1,) at `up` times a channel's own rate, centred; h is a multiple of `down`."""
     taps = low_pass(PASS, STOP, ATTENUATION, up * own_over_grid, multiple=down)  # in grid rates
     return np.asarray(taps * up, dtype=np.float64)
 

@@ -67,7 +67,7 @@ def lost(name: str, damage: str) -> Column:
 
 
 def whole(name: str, values: NDArray[Any], unit: str | None = None, clock: EvenTimes | None = None) -> Column:
-    """A column whose values are in memory."""
+    """A column whose values (T,) are in memory."""
     return Column(name, len(values), lambda a, b: values[a:b], unit, clock)
 
 
@@ -371,7 +371,7 @@ class _Series:
 
 
 def floats(values: NDArray[Any]) -> tuple[FloatArray, int]:
-    """Values as floats, NaN for what is no number, and how many of those there are; None and NaN are merely missing."""
+    """Values (T,) as floats, NaN for what is no number, and how many of those there are; None is merely missing."""
     if values.dtype.kind in "fiub":
         return values.astype(np.float64, copy=False), 0
     out = np.full(len(values), np.nan)

@@ -82,7 +82,7 @@ def _few(split: Split, count: int) -> tuple[Tensor, Tensor]:
 
 
 def every_window(split: Split) -> tuple[Tensor, Tensor]:
-    """Rows and starts of all 26 windows of every trajectory."""
+    """Rows and starts of all 26 windows of every one of N trajectories, each (26 N,)."""
     each = ROLLOUT - WINDOW + 1
     count = len(split.embeddings)
     return torch.arange(count).repeat_interleave(each), torch.arange(each).repeat(count)

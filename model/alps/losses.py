@@ -73,5 +73,5 @@ def tempered(squared: Tensor, outlier: float) -> Tensor:
 
 
 def picture_loss(drawn: Tensor, pictures: Tensor) -> Tensor:
-    """Mean squared error of pixels in [0, 1]."""
+    """Mean squared error of pixels in [0, 1], of two tensors of one shape (...)."""
     return torch.nn.functional.mse_loss(drawn, pictures)

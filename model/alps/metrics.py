@@ -42,7 +42,7 @@ def explained(task: Task, simulated: Tensor, true: Tensor) -> list[float]:
 
 
 def relative_state_error(task: Task, simulated: Tensor, true: Tensor) -> float:
-    """rms of the error over rms of the truth's variation, each state in units of its scale."""
+    """rms of the error over rms of the truth's variation, states (B, T, N) each in units of its scale."""
     scale = true.new_tensor(task.state_scale)
     error = (task.difference(simulated, true) / scale).square().mean()
     spread = (task.difference(true, true.mean((0, 1), keepdim=True)) / scale).square().mean()
@@ -55,7 +55,7 @@ def parameter_error(estimated: Tensor, true: Tensor) -> float:
 
 
 def relative_parameter_error(estimated: Tensor, true: Tensor) -> float:
-    """Mean of |estimated - true| / true over windows and parameters."""
+    """Mean of |estimated - true| / true over windows and parameters (B, P)."""
     return float(((estimated - true).abs() / true.abs()).mean())
 
 

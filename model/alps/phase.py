@@ -56,7 +56,10 @@ def balance(supports: np.ndarray, response: np.ndarray) -> np.ndarray:
 
 
 def features(kind: str, supports: np.ndarray, response: np.ndarray) -> torch.Tensor:
-    """`magnitude`: log |U|, log |Z|.  `phase`: those, and Z conj(U_i) / (|Z| |U_i|), the phases between them."""
+    """`magnitude`: log |U|, log |Z|.  `phase`: those, and Z conj(U_i) / (|Z| |U_i|), the phases between them.
+
+    Of spectra U of supports (B, F, I) and Z of a response (B, F), one row for each of B.
+    """
     signals = np.concatenate([supports, response[:, :, None]], axis=2)
     size = np.log(np.abs(signals) + 1e-3)
     parts = [size.reshape(len(size), -1)]

@@ -25,17 +25,17 @@ def gaussian_sample(mean: Tensor, log_std: Tensor) -> Tensor:
 
 
 def gaussian_divergence(mean: Tensor, log_std: Tensor) -> Tensor:
-    """KL to the unit Gaussian, elementwise."""
+    """KL to the unit Gaussian, elementwise; both of one shape (...)."""
     return 0.5 * (mean.square() + torch.exp(2 * log_std) - 1) - log_std
 
 
 def bessel_ratio(concentration: Tensor) -> Tensor:
-    """A(k) = I1(k) / I0(k), the mean of cos delta."""
+    """A(k) = I1(k) / I0(k), the mean of cos delta, elementwise."""
     return torch.special.i1e(concentration) / torch.special.i0e(concentration)
 
 
 def log_bessel(concentration: Tensor) -> Tensor:
-    """log I0(k) without overflow."""
+    """log I0(k) without overflow, elementwise."""
     return torch.log(torch.special.i0e(concentration)) + concentration
 
 

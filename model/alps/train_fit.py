@@ -161,7 +161,7 @@ class SensorAutoencoder(nn.Module):
 
 
 def halves(data: TrainData) -> tuple[Tensor, Tensor]:
-    """Rows of the training and the test trajectories: 50-50."""
+    """Rows (N / 2,) of the training and the test trajectories: 50-50."""
     half = len(data.states) // 2
     return torch.arange(half), torch.arange(half, len(data.states))
 

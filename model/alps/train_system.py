@@ -98,7 +98,7 @@ def to_states(points: FloatArray) -> FloatArray:
 
 
 def to_points(states: FloatArray) -> FloatArray:
-    """The inverse of `to_states`."""
+    """The inverse of `to_states`: states (..., 18) -> values of the sensors (..., 18)."""
     shaped = states.reshape(*states.shape[:-1], -1, 3)
     heave = shaped[..., :1]
     return np.concatenate([heave, heave + _ARM * shaped[..., 1:]], axis=-1).reshape(states.shape)

@@ -116,7 +116,7 @@ def align(encoded: Tensor, true: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 def opening(components: Tensor) -> tuple[Tensor, Tensor]:
-    """Bodies opposite each other about the middle."""
+    """Bodies opposite each other about the middle: a map (4, 2) and an offset (4,)."""
     eye = torch.eye(2).to(components)
     return torch.cat([eye, -eye]), components.new_zeros(4)
 

@@ -58,5 +58,5 @@ def nodes(frequency: FloatArray, per_octave: float) -> FloatArray:
 
 
 def log_level(basis: FloatArray, power: FloatArray) -> FloatArray:
-    """Values at the nodes for a level over frequency, least squares of the logarithms."""
+    """Values (K,) at the nodes of a basis (F, K) for a power (F,) over frequency, least squares of the logarithms."""
     return np.asarray(np.linalg.lstsq(basis, np.log(power), rcond=None)[0])

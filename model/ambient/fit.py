@@ -40,7 +40,7 @@ class PosteriorFit:
 def fit(
     likelihood: Likelihood, x: FloatArray, prior: Prior, free: BoolArray | None = None, limit: int = 40
 ) -> PosteriorFit:
-    """Scoring from `x` with a Gaussian prior; values that are not `free` are fixed and count as known."""
+    """Scoring from `x` (X,) with a Gaussian prior; values that are not `free` (X,) are fixed and count as known."""
     chosen = np.flatnonzero(np.ones(len(x), dtype=bool) if free is None else free)
     precision = prior.std[chosen] ** -2.0
     damping, converged, iterations = 1e-3, False, 0

@@ -35,7 +35,7 @@ class Sensing:
 
 
 def sensing(mechanics: Mechanics, sensors: IntArray, noise: FloatArray) -> Sensing:
-    """For the sensors at indices `sensors` with standard deviations `noise` of one sample."""
+    """For the sensors at indices `sensors` (S,) with standard deviations `noise` (S,) of one sample, in their units."""
     kind, S, L = mechanics.sensor_kind[sensors], mechanics.S[sensors], mechanics.L[sensors]
     rows, spare, kinds = [], [], []
     for of_kind in np.unique(kind):

@@ -104,7 +104,7 @@ class Whittle:
 
 
 def adjoint(matrix: np.ndarray) -> np.ndarray:
-    """Conjugate transpose of the last two axes."""
+    """Conjugate transpose of matrices (..., n, m), (..., m, n)."""
     return np.asarray(matrix.conj().swapaxes(-1, -2))
 
 

@@ -65,7 +65,7 @@ def sites(system: System) -> list[EquationSite]:
 
 
 def linear(row: FloatArray, names: Callable[[int], str]) -> str:
-    """A linear combination as text: `0.5*a - b`."""
+    """A linear combination of a row (N,) as text: `0.5*a - b`."""
     return total(*(f"{weight!r}*{names(i)}" for i, weight in enumerate(row.tolist()) if weight != 0))
 
 

@@ -76,6 +76,6 @@ def longer_than(limit: str) -> str:
 
 
 def pooled_nrmse(per_sensor: FloatArray) -> float:
-    """rms over sensors of each sensor's error divided by its own rms; NaN sensors are absent."""
+    """rms over sensors (S,) of each sensor's error divided by its own rms; NaN sensors are absent."""
     shown = per_sensor[np.isfinite(per_sensor)]
     return float(np.sqrt(np.mean(shown**2))) if len(shown) else float("nan")

@@ -39,7 +39,7 @@ class Runs:
 
 
 def track_spectrum(wave_number: FloatArray, roughness: float = ERRI_LOW) -> FloatArray:
-    """ERRI B176 vertical power spectral density, m^2/(rad/m), of wave numbers in rad/m."""
+    """ERRI B176 vertical power spectral density (F,), m^2/(rad/m), of wave numbers (F,) in rad/m."""
     return roughness / (wave_number**4 + 0.6803895 * wave_number**2 + 0.00028855)
 
 

@@ -281,7 +281,7 @@ def empty_memory(motion: Motion, p: Values, element: SpringDamper) -> Any:
 
 
 def no_memory(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
-    """Rate of the memory of a law that has none."""
+    """Rate of the memory of a law that has none, (0, ...)."""
     return np.zeros((0, *np.shape(motion.deflection)))
 
 

@@ -203,7 +203,7 @@ def _trials(form: Shape, seen: Observed) -> FloatArray:
 
 
 def filtered(law: ElementLaw, tau: int) -> Callable[[Motion, Values], FloatArray]:
-    """Force along an evenly sampled motion: z' = v - z / tau is a first-order filter of the deflection."""
+    """Force (T,) along an evenly sampled motion: z' = v - z / tau is a first-order filter of the deflection."""
 
     def path(motion: Motion, p: Values) -> FloatArray:
         time, d = np.asarray(motion.time), np.asarray(motion.deflection)

@@ -17,7 +17,7 @@ _SERIES = 0.5  # below this the recursion for phi loses digits and the power ser
 
 
 def phi(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """phi_0 = exp, phi_1, phi_2, phi_3 of real numbers: phi_l(x) = x phi_{l+1}(x) + 1/l!."""
+    """phi_0 = exp, phi_1, phi_2, phi_3 of real numbers (...): phi_l(x) = x phi_{l+1}(x) + 1/l!."""
     x = np.asarray(x, dtype=float)
     small = np.abs(x) < _SERIES
     safe = np.where(small, 1.0, x)

@@ -52,14 +52,14 @@ def motion(measured: Mapping[int, FloatArray], dt: float, noise: Noises) -> tupl
 
 
 def motion_noise(omega: FloatArray, dt: float, noise: Noises) -> FloatArray:
-    """Standard deviation per sample of that displacement at angular frequencies omega > 0; 0 where it is exact."""
+    """Standard deviation, m per sample, of that displacement at omega (F,) > 0, rad/s; 0 where it is exact."""
     if min(noise[order] for order in used(noise)) <= 0:
         return np.zeros(len(omega))
     return np.asarray(1 / np.sqrt(_precision(omega, dt, noise).sum(axis=0)))
 
 
 def motion_shares(omega: FloatArray, dt: float, noise: Noises) -> dict[int, FloatArray]:
-    """Share of every measured derivative in that displacement at angular frequencies omega > 0, by order."""
+    """Share (F,) of every measured derivative in that displacement at omega (F,) > 0, rad/s, by order."""
     orders = used(noise)
     if noise[orders[0]] <= 0:
         return {order: np.full(len(omega), float(order == orders[0])) for order in noise}

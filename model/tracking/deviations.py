@@ -342,7 +342,7 @@ def without_data_sheets(
 
 
 def linearisation_std(gain: FloatArray) -> FloatArray:
-    """Standard deviations of gains of this size that come from linearising windows without correcting them."""
+    """Standard deviations (H,) of gains (H,) that come from linearising windows without correcting them."""
     return np.asarray(LINEARISATION_ERROR * np.minimum(np.abs(gain), CORRECTED_GAIN) ** 2)
 
 

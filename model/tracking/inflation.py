@@ -40,7 +40,7 @@ def start(shape: tuple[int, ...]) -> VarianceInflation:
 def update(
     inflation: VarianceInflation, value: FloatArray, variance: FloatArray, mask: BoolArray, *, time: int, window: int
 ) -> VarianceInflation:
-    """After the window of `window` ns that starts at `time`.
+    """After the window of `window` ns that starts at `time`; values, variances and mask (..., P).
 
     Components outside `mask`, and those whose anchor it still overlaps, keep their anchor.
     """

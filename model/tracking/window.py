@@ -68,5 +68,5 @@ def noise_weight(noise: float) -> float:
 
 
 def is_covariance(matrix: FloatArray) -> bool:
-    """Whether a matrix is finite and positive definite."""
+    """Whether a matrix (n, n) is finite and positive definite."""
     return bool(np.all(np.isfinite(matrix))) and dpotrf(matrix, lower=1)[1] == 0

@@ -42,18 +42,18 @@ def unpack_ints(data: list[Any]) -> Ints:
 
 
 def pack_floats(values: FloatArray) -> list[Any]:
-    """Float64 as they are."""
+    """Float64 of any shape as they are."""
     return [list(values.shape), np.ascontiguousarray(values, dtype="<f8").tobytes()]
 
 
 def unpack_floats(data: list[Any]) -> FloatArray:
-    """The inverse of `pack_floats`."""
+    """The inverse of `pack_floats`, of the same shape."""
     shape, content = data
     return np.frombuffer(content, "<f8").reshape(shape).astype(np.float64)
 
 
 def log_steps(values: FloatArray) -> Ints:
-    """Positive numbers in steps of 1.6 %; 0 and NaN have numbers of their own."""
+    """Positive numbers (...) in steps of 1.6 % (...); 0 and NaN have numbers of their own."""
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = np.round(np.log(values) / LOG_STEP)
     finite = np.clip(np.nan_to_num(steps, posinf=9000.0), -9000, 9000)
@@ -61,7 +61,7 @@ def log_steps(values: FloatArray) -> Ints:
 
 
 def from_log_steps(steps: Ints) -> FloatArray:
-    """The inverse of `log_steps`."""
+    """The inverse of `log_steps`, elementwise."""
     found = np.exp(np.minimum(steps, 9000) * LOG_STEP)
     return np.where(steps == 9999, 0.0, np.where(steps == 9998, np.nan, found))
 
@@ -78,7 +78,7 @@ def pack_spd(matrices: FloatArray) -> list[Any]:
 
 
 def unpack_spd(data: list[Any]) -> FloatArray:
-    """The inverse of `pack_spd`: positive definite wherever its scale is not 0."""
+    """The inverse of `pack_spd`, shape (n, k, k): positive definite wherever its scale is not 0."""
     size, packed_scale, packed_steps = data
     scale = from_log_steps(unpack_ints(packed_scale))
     partial = np.tanh(unpack_ints(packed_steps) * PARTIAL_STEP)

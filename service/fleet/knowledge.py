@@ -277,7 +277,7 @@ def temperature_effects(modes: Sequence[CommonMode]) -> tuple[TemperatureEffect,
 
 
 def part_of(time: np.ndarray) -> np.ndarray:
-    """Days since the epoch: what happens on one day happens together."""
+    """Days since the epoch (N,) of times (N,), ns: what happens on one day happens together."""
     return time // int(DAY_NS)
 
 

@@ -40,8 +40,10 @@ def unmeasured(engine: Engine) -> bool:
 
 
 def whole_windows(engine: Engine, excerpt: Excerpt | None) -> Iterator[tuple[int, FloatArray]]:
-    """Windows one after the other, oldest first, counted back from the newest sample; channels with a gap are absent.
-    None without any sensor, or without what the system needs of its inputs."""
+    """Windows (T, C) one after the other, oldest first, counted back from the newest sample.
+
+    Channels with a gap are absent.  None without any sensor, or without what the system needs of its inputs.
+    """
     if excerpt is None or unmeasured(engine):
         return
     length, inputs = engine.system.window, len(engine.system.inputs)

@@ -268,7 +268,7 @@ def physical(engine: Engine, log_ratio: FloatArray, std: FloatArray) -> list[tup
 
 
 def sensor_dict(engine: Engine, per_sensor: FloatArray) -> dict[str, float]:
-    """nrmse by sensor, absent sensors left out."""
+    """nrmse (S,) by sensor, absent sensors left out."""
     pairs = zip(engine.system.sensors, per_sensor.tolist(), strict=True)
     return {name: value for name, value in pairs if math.isfinite(value)}
 

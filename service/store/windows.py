@@ -176,12 +176,12 @@ def latest_window(connection: Connection, vehicle: str, model_id: int) -> Window
 
 
 def pack(values: FloatArray) -> bytes:
-    """Little-endian float64 bytes."""
+    """Little-endian float64 bytes of values of any shape."""
     return np.ascontiguousarray(values, dtype="<f8").tobytes()
 
 
 def unpack(data: bytes) -> FloatArray:
-    """The inverse of `pack`, as a read-only array."""
+    """The inverse of `pack`, as a read-only array (N,)."""
     return np.frombuffer(data, dtype="<f8").astype(np.float64, copy=False)
 
 

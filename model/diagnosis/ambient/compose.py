@@ -131,7 +131,7 @@ def _findings(
 
 
 def modes_at(system: System, log_ratio: FloatArray) -> list[Mode]:
-    """Natural modes at given log-ratios, by frequency."""
+    """Natural modes at log-ratios (P,), by frequency."""
     modes = sorted(mechanics_at(system, log_ratio).modes(system.bodies), key=lambda mode: mode.frequency)
     return [mode for mode in modes if mode.frequency > 1e-6 * modes[-1].frequency]
 

@@ -63,8 +63,8 @@ def identified_laws(
 ) -> tuple[IdentifiedLaw, ...]:
     """The first `count` laws of a fit and its preload, in the form of a system file.
 
-    full, names: covariance of the fit; sign: -1 if the measured force was inverted.  Dependences on measured signals
-    cannot be expressed in a system file and are omitted.
+    full (K, K), names (K,): covariance of the fit; sign: -1 if the measured force was inverted.  Dependences on
+    measured signals cannot be expressed in a system file and are omitted.
     """
     found = [_as_placed(held, element) for held in fit.task.held]
     for index, piece in enumerate(fit.model.pieces[:count]):

@@ -322,7 +322,7 @@ def _prior_residual(problem: Problem, point: Point) -> tuple[FloatArray, FloatAr
 
 
 def information(problem: Problem, fit: Fit) -> FloatArray:
-    """Information matrix of theta, the terms' parameters (internal scale) and the state, priors included."""
+    """Information matrix of theta, the terms' parameters (internal scale) and the state, priors included, (X, X)."""
     return _with_expected(problem, fit.point, fit.jacobian.T @ fit.jacobian)
 
 

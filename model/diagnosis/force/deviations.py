@@ -84,7 +84,7 @@ def _jacobian(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
 
 
 def left_open(fit: ComponentFit, alike: Sequence[FloatArray] = ()) -> FloatArray:
-    """Systematic part of the covariance, in the order of `covariance`.
+    """Systematic part of the covariance (K, K), in the order of `covariance`.
 
     alike: changes of the values with look-alike laws (`moved_in_common`).
     """
@@ -158,7 +158,7 @@ def _by_delay(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
 
 
 def moved_in_common(other: ComponentFit, found: ComponentFit) -> FloatArray:
-    """Changes of the values that both models share with another law in one place, in the order of `covariance`."""
+    """Changes (K,) of the values that both models share with another law in one place, ordered as `covariance`."""
     there, here = _in_common(other, found.model), _in_common(found, found.model)
     return np.where(there == 0.0, 0.0, there - here)
 
@@ -202,7 +202,7 @@ def _per_lag(fit: ComponentFit, lag: Lag, shape: Sequence[float]) -> FloatArray:
 
 
 def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations of a piece's law parameters and quoted values, by linear propagation."""
+    """Standard deviations of a piece's law parameters (p,) and quoted values (q,), by linear propagation."""
     count = len(names)
     at = count + sum(len(p.signs) for p in fit.model.pieces[:index])
     own = list(range(at, at + len(fit.model.pieces[index].signs)))

@@ -183,7 +183,7 @@ def still_stretches(series: FloatArray, sample_rate: float, all_rules: Rules = R
 
 
 def noise_at_rest(series: FloatArray, stretches: list[slice]) -> float | None:
-    """Standard deviation about a line over the stretches of standstill; None without any."""
+    """Standard deviation of a series (T,) about a line over the stretches of standstill; None without any."""
     squares, count = 0.0, 0
     for stretch in stretches:
         values = series[stretch]

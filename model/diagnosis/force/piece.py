@@ -382,6 +382,7 @@ def no_shapes(seen: MotionSizes) -> FloatArray:
 
 
 def rates_at(seen: MotionSizes, shares: Sequence[float]) -> FloatArray:
+    """Rates, m/s, that so many shares (N,) of the time are not exceeded, (N,)."""
     return np.interp(shares, np.linspace(0, 1, 101), seen.rate)
 
 

@@ -257,7 +257,7 @@ def plausible(fit: ComponentFit, index: int = -1) -> bool:
 
 
 def determined(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> bool:
-    """Whether a law's first parameter and first quoted value are significant under a covariance and its names."""
+    """Whether a law's first parameter and first quoted value are significant under a named covariance (K, K)."""
     sigma = spread(fit, index, full, names)
     values = [fit.values(index), fit.quoted(index)]
     significant = [

@@ -101,7 +101,7 @@ def verdict_of(
 def bounded_noise(
     learnt: FloatArray, declared: FloatArray, measured: FloatArray, slack: float = RULES.verdict.slack
 ) -> FloatArray:
-    """Noise levels for the floor: as estimated, but at most as declared or independently measured.
+    """Noise levels (S,) for the floor: as estimated, but at most as declared or independently measured, all (S,).
 
     slack: factor on declarations, which are round numbers.
     """

@@ -28,7 +28,7 @@ HIGH_PASS_ORDER = 4  # Butterworth, run forwards and backwards
 
 
 def high_pass_gain(ratio: FloatArray) -> FloatArray:
-    """Gain at frequencies in units of the cutoff: a Butterworth filter's, squared."""
+    """Gain at frequencies (F,) in units of the cutoff: a Butterworth filter's, squared."""
     power = np.abs(ratio) ** (2 * HIGH_PASS_ORDER)
     gain: FloatArray = power / (1 + power)
     return gain

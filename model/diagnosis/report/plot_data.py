@@ -26,7 +26,10 @@ _BINS = 41
 def plot_data_of(
     state: Investigation, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
 ) -> dict[str, NDArray[Any]]:
-    """All arrays of an investigation; `order`: place and effect of every finding, as reported."""
+    """All arrays of an investigation.
+
+    floor: bounded noise (S,), in the sensors' units; order: place and effect of every finding, as reported.
+    """
     rate = state.signals.sample_rate
     start = state.held.split + round(state.signals.start * rate)
     arrays: dict[str, NDArray[Any]] = {

@@ -26,6 +26,7 @@ _OWN = ("stiffness", "damping")  # of an element, its force's slopes over deflec
 
 
 def figures(names: Sequence[str], per_sensor: FloatArray) -> FitFigures:
+    """Figures of fit from every sensor's error over its signal, rms over rms, (S,)."""
     return FitFigures(
         nrmse=float(np.sqrt(np.mean(np.asarray(per_sensor) ** 2))),
         per_sensor={name: float(value) for name, value in zip(names, per_sensor, strict=True)},

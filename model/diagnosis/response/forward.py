@@ -371,7 +371,7 @@ def _lagged(polynomial: FloatArray, lag: FloatArray) -> FloatArray:
 
 
 def propagate(A: FloatArray, rows: FloatArray, state: FloatArray, step: float, count: int) -> FloatArray:
-    """rows e^{A t} state at t = 0, step, ...: (count, len(rows)), states by doubling."""
+    """rows (R, N) e^{A t} state (N,) at t = 0, step, ...: (count, R), states by doubling; A (N, N), step in s."""
     power = expm(A * step)
     states = np.empty((count, len(state)))
     states[0] = state

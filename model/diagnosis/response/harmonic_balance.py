@@ -168,7 +168,7 @@ def fixed_point(
     tolerance: float = TOLERANCE,
     patience: int = _PATIENCE,
 ) -> tuple[FloatArray, bool]:
-    """f = step(f) by Anderson acceleration; returns the best point and whether the tolerance was met."""
+    """f = step(f), of any shape, by Anderson acceleration; returns the best point and whether the tolerance was met."""
     shape = start.shape
     x = start.ravel()
     image = step(start).ravel()

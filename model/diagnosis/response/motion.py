@@ -24,6 +24,7 @@ class Motions:
 
 
 def motions_of(forward: Forward, forces: LawForces | None, state: FloatArray) -> Motions:
+    """Motion with laws' forces and free motion from a state (N,); forces None: that of the linear part alone."""
     plant, grid = forward.plant, forward.part.grid
     s = plant.structure
     n = len(s.mass)

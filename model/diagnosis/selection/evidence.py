@@ -31,7 +31,7 @@ _SINGULAR = 1e-13  # relative variance below which only rounding remains
 
 
 def block_edges(bins: int, rules: EvidenceRules = RULES.evidence) -> np.ndarray:
-    """Edges of the frequency blocks over `bins` bins, each at least one bin: [0, ..., < bins]."""
+    """Edges (blocks,) of the frequency blocks over `bins` bins, each at least one bin: [0, ..., < bins]."""
     if bins <= rules.first_block:
         return np.array([0])
     edges = np.unique(np.round(np.geomspace(rules.first_block, bins, rules.blocks)).astype(int))
@@ -56,7 +56,7 @@ def process_gain(
     log_dets: tuple[float, float],
     rules: EvidenceRules = RULES.evidence,
 ) -> float:
-    """Gain of residuals weighted by covariances of their own, with the log determinants of both.
+    """Gain of residuals (2 F S,) weighted by covariances of their own, with the log determinants of both.
 
     A model with a lower noise level of the measured forces has larger weights: its blocks may rise while its
     determinant falls.  Both are parts of one likelihood, so no block is bounded.
@@ -80,7 +80,7 @@ def _of_blocks(
 def bounded_gain(logs: FloatArray, falls: FloatArray) -> float:
     """Sum of logarithmic gains of blocks, with losses weighted by no more than their share of the power.
 
-    logs, falls: n log(before / after) and the fall of chi-square of every block, of the same signs.
+    logs, falls: n log(before / after) and the fall of chi-square of every block (K,), of the same signs.
     """
     up, down = float(np.sum(logs[logs > 0])), -float(np.sum(logs[logs < 0]))
     fall, rise = float(np.sum(falls[falls > 0])), -float(np.sum(falls[falls < 0]))

@@ -56,7 +56,7 @@ class FaultExplanation:
 
 
 def fit_limit(freedom: FloatArray) -> FloatArray:
-    """Chi-square per degree of freedom beyond which a window does not fit."""
+    """Chi-square per degree of freedom, of which there are `freedom` (B,), beyond which a window does not fit, (B,)."""
     return np.asarray(1 + FIT_SIGMAS * np.sqrt(2 / np.maximum(freedom, 1)), dtype=np.float64)
 
 

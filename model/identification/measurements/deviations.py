@@ -127,7 +127,10 @@ def _bodies(system: System) -> list[str]:
 def named(
     deviations: Sequence[Deviation], values: FloatArray, std: FloatArray, chosen: BoolArray
 ) -> tuple[MeasurementFault, ...]:
-    """Gains and delays as faults of channels; a delay that all channels of a clock share is one fault of them all."""
+    """Gains and delays among deviations (H,), those that are `chosen` (H,), as faults of channels.
+
+    A delay that all channels of a clock share is one fault of them all.
+    """
     found = [
         MeasurementFault(deviations[h].name, "gain", float(1 + values[h]), float(std[h]))
         for h in np.flatnonzero(chosen).tolist()

@@ -386,6 +386,6 @@ def _limited(step: Tensor) -> Tensor:
 
 
 def in_order(parts: list[Refined], order: np.ndarray) -> Refined:
-    """One batch of pieces whose windows are `order`, each in its place."""
+    """One batch of pieces whose windows are `order` (B,), each in its place."""
     whole = Refined(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in Refined.__slots__})
     return whole if (np.diff(order) > 0).all() else whole.take(np.argsort(order))

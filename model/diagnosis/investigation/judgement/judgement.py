@@ -134,7 +134,7 @@ def _compared(state: Investigation, noise: Noise) -> tuple[tuple[Fit, Noise], ..
 
 
 def unmeasured_share(fit: Fit, force: FloatArray) -> float:
-    """Unmeasured forces, as noise of the measured ones, relative to the inertia forces, rms over rms."""
+    """Unmeasured forces, noise (I,), N, of the measured ones, relative to the inertia forces, rms over rms."""
     structure = fit.forward.plant.structure
     inertia = structure.mass * fit.forward.part.grid.inverse(fit.motions.acceleration)
     return float(np.sqrt(np.sum(structure.F**2 @ force**2) / np.sum(np.mean(inertia**2, axis=0))))

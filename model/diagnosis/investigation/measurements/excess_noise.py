@@ -44,13 +44,13 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
 
 
 def is_what_is_left(noise: np.ndarray, error: np.ndarray, rules: NoiseRules) -> np.ndarray:
-    """Whether noise is about as large as the error of a free run, both as powers."""
+    """Whether noise is about as large as the error of a free run, both as powers (S,); (S,)."""
     found: np.ndarray = (noise > rules.of_error * error) & (error > rules.of_error * noise)
     return found
 
 
 def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
-    """Noise over declared noise above the compared band, up to where anti-alias filters cut, per sensor.
+    """Noise over declared noise (S,) above the compared band, up to where anti-alias filters cut, (S,).
 
     It is the residual's there, but at most the measured signal's: a wrong structure may resonate where nothing moves.
     """
@@ -69,9 +69,9 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
 def outliers(
     names: list[str], ratio: np.ndarray, white: np.ndarray, count: float, rules: NoiseRules
 ) -> list[NoiseFault]:
-    """Outliers among ratios of noise to declared noise, each by the median of the others; fewer than two say nothing.
+    """Outliers among ratios (N,) of noise to declared noise, each by the others' median; fewer than two say nothing.
 
-    white: whether the noise goes on above the compared band.  count: bins that inform on it.
+    white (N,): whether the noise goes on above the compared band.  count: bins that inform on it.
     """
     found = []
     for i, name in enumerate(names):

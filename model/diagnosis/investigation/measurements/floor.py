@@ -43,7 +43,7 @@ def bounded(state: Investigation) -> Noise:
 
 
 def realised_floor(expected: FloatArray, after: FreeRun, rules: VerdictRules = RULES.verdict) -> FloatArray:
-    """Noise floor of each sensor on the held-out samples themselves.
+    """Noise floor (S,) of each sensor on the held-out samples themselves, in its unit.
 
     `expected` is the mean for the estimated noise.  If the error of the free run agrees with it within sampling error,
     it is noise, and the floor of these samples; if it is smaller, so is the noise, which is part of it.
