@@ -139,6 +139,7 @@ async def remove(
     """Windows, alarms, marks, reports and uploaded files go; the audit log keeps that they did."""
     if confirm != id_:
         raise ApiProblem(422, "confirm must repeat the vehicle's id", [{"field": "confirm", "detail": "is another id"}])
+    await run_in_threadpool(core.jobs.give_up, id_, actor.name)  # what they store would bring the vehicle back
     await run_in_threadpool(core.operations.remove, actor.name, id_)
     return Response(status_code=204)
 

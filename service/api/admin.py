@@ -19,6 +19,7 @@ from sprung.service.api.access import CoreOf, read
 from sprung.service.api.actors import ActorOf
 from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import LINE_PATTERN, StrictBody
+from sprung.service.errors import Busy
 from sprung.service.store import audit
 from sprung.service.store.tokens import TokenRow
 from sprung.service.times import optional_iso, to_iso
@@ -27,6 +28,8 @@ router = APIRouter(tags=["operation"])
 pages = APIRouter(include_in_schema=False)
 SAMPLE_SECONDS = 0.01
 MOST_STACKS = 2000
+PROFILE_SECONDS = 30
+_profiling = threading.Lock()
 
 
 Scope = Literal["read", "ingest", "operate", "admin"]
@@ -88,10 +91,15 @@ async def audit_log(
 
 
 @pages.get("/debug/profile")
-async def profile(seconds: Annotated[float, Query(gt=0, le=30)] = 3.0) -> PlainTextResponse:
+async def profile(seconds: Annotated[float, Query(gt=0, le=PROFILE_SECONDS)] = 3.0) -> PlainTextResponse:
     """Stacks of every thread, looked at a hundred times a second, one line each with its count: the format that flame
     graphs are drawn from."""
-    return PlainTextResponse(await run_in_threadpool(stacks, seconds))
+    if not _profiling.acquire(blocking=False):  # each holds a thread that answers requests
+        raise Busy("a profile is being taken already", PROFILE_SECONDS)
+    try:
+        return PlainTextResponse(await run_in_threadpool(stacks, seconds))
+    finally:
+        _profiling.release()
 
 
 def stacks(seconds: float) -> str:

@@ -30,6 +30,7 @@ T = TypeVar("T")
 WORST_MESSAGE = "an unexpected error; the service's log has the details"
 MOST_ATTEMPTS = 2
 PROGRESS_SECONDS = 1.0  # between two notes of progress in the store
+GIVE_UP_SECONDS = 20.0  # within which a cancelled job ends: it is asked several times a second, or after a batch
 RETRY_SECONDS = 5.0  # while the store refuses to take what became of a job
 
 
@@ -188,6 +189,18 @@ class Jobs:
             running.cancel()
         with self._store.read() as connection:
             return work.get_job(connection, job_id) or job
+
+    def give_up(self, vehicle: str, by: str) -> None:
+        """Cancel every job of a vehicle, and wait until none of them runs.  Raises Busy when one does not end."""
+        with self._store.read() as connection:
+            left = [job.id for job in work.unfinished_jobs(connection) if job.vehicle_id == vehicle]
+        for job in left:
+            self.cancel(job, by)
+        until = time.monotonic() + GIVE_UP_SECONDS
+        while any(job in self._current for job in left):
+            if time.monotonic() > until:
+                raise Busy(f"a job of {vehicle} has not ended yet; try again", retry_after=10)
+            time.sleep(0.05)
 
     def close(self) -> None:
         """Interrupt the running jobs; they and the waiting ones stay queued in the store."""

@@ -6,7 +6,6 @@ reads a vehicle's tracker to write it holds the vehicle's row (`fleet.hold_vehic
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
 
 from sprung.model.text import first_line
 from sprung.service.errors import UserError
+from sprung.service.store.turns import Turns
 
 BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
 PROBE_SECONDS = 2.0
@@ -39,7 +39,7 @@ class Store:
         event.listen(engine, "handle_error", _name_store)
         self.many_writers = engine.dialect.name == "postgresql"
         # one writer a process where the database has one anyway: waiting is fair here
-        self._writing = threading.BoundedSemaphore(MOST_WRITERS if self.many_writers else 1)
+        self.turns = Turns(MOST_WRITERS if self.many_writers else 1)
         self.on_wait: Callable[[float], None] = lambda seconds: None  # takes each transaction's wait to write
         self.months: set[str] = set()  # partitions that are known to be there (`partitions.prepare`)
 
@@ -54,34 +54,32 @@ class Store:
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
-        """One transaction, committed at the end, rolled back when anything raises."""
+        """One transaction, committed at the end, rolled back when anything raises.
+
+        Raises SQLAlchemyError where its turn does not come, or the database does not take it.
+        """
         asked = time.perf_counter()
-        with self._writing, self.engine.connect() as connection:
+        with self.turns.turn(), self.engine.connect() as connection:
             connection.execution_options(sprung_write=True)
             with connection.begin():
                 self.on_wait(time.perf_counter() - asked)
                 yield connection
 
     def probe(self) -> None:
-        """Raises SQLAlchemyError or TimeoutError when nothing can be written now; changes nothing."""
-        if not self._writing.acquire(timeout=PROBE_SECONDS):
-            raise TimeoutError("another transaction has not ended for a while")
-        try:
-            with self.engine.connect() as connection:
-                sqlite_store = connection.dialect.name == "sqlite"
+        """Raises SQLAlchemyError when nothing can be written now; changes nothing."""
+        with self.turns.turn(PROBE_SECONDS), self.engine.connect() as connection:
+            sqlite_store = connection.dialect.name == "sqlite"
+            if sqlite_store:
+                connection.exec_driver_sql(f"PRAGMA busy_timeout = {round(1000 * PROBE_SECONDS)}")
+                connection.rollback()
+            try:
+                connection.execution_options(sprung_write=True)
+                with connection.begin() as transaction:
+                    connection.execute(text("SELECT 1"))
+                    transaction.rollback()
+            finally:
                 if sqlite_store:
-                    connection.exec_driver_sql(f"PRAGMA busy_timeout = {round(1000 * PROBE_SECONDS)}")
-                    connection.rollback()
-                try:
-                    connection.execution_options(sprung_write=True)
-                    with connection.begin() as transaction:
-                        connection.execute(text("SELECT 1"))
-                        transaction.rollback()
-                finally:
-                    if sqlite_store:
-                        connection.exec_driver_sql(f"PRAGMA busy_timeout = {BUSY_MILLISECONDS}")
-        finally:
-            self._writing.release()
+                    connection.exec_driver_sql(f"PRAGMA busy_timeout = {BUSY_MILLISECONDS}")
 
     def close(self) -> None:
         """Close every connection; SQLite then folds its write-ahead log into the file."""

@@ -79,6 +79,10 @@ def retire(connection: Connection, vehicle: str, since: int | None) -> None:
 
 def remove(connection: Connection, vehicle: str) -> RemovedVehicle:
     """Delete a vehicle with everything that is known of it; the audit log keeps that it was deleted."""
+    # of those that no job has read to the end it is known by the job alone
+    asked = select(jobs.c.recording_id).where(jobs.c.vehicle_id == vehicle, jobs.c.recording_id.is_not(None))
+    unread = recordings.c.vehicle_id.is_(None) & recordings.c.id.in_(asked)
+    connection.execute(update(recordings).where(unread).values(vehicle_id=vehicle))
     own = recordings.c.vehicle_id == vehicle
     files = connection.execute(select(recordings.c.file).where(own, recordings.c.file.is_not(None))).scalars().all()
     pages = connection.execute(select(reports.c.id).where(reports.c.vehicle_id == vehicle)).scalars().all()

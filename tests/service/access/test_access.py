@@ -18,6 +18,7 @@ from sqlalchemy.exc import OperationalError
 from sprung.model.system import System
 from sprung.service.access.notice import access_notice, is_loopback
 from sprung.service.access.tokens import Refused, Tokens
+from sprung.service.api import admin
 from sprung.service.api.guard import COOKIE, Limiter
 from sprung.service.api.problems import ApiProblem, _as_problem
 from sprung.service.api.scopes import NEEDS, need_of
@@ -499,6 +500,10 @@ def test_what_is_not_stored_is_not_written_down_and_the_other_way_round(
 def test_a_profile_names_the_threads(client: TestClient) -> None:
     text = client.get("/debug/profile?seconds=0.1").text
     assert "sprung-compute;" in text
+    with admin._profiling:  # one at a time: each holds a thread that answers requests
+        answer = client.get("/debug/profile?seconds=0.1")
+    assert answer.status_code == 503 and answer.headers["retry-after"] == "30"
+    assert client.get("/debug/profile?seconds=0.1").status_code == 200
 
 
 def test_requests_have_a_name_and_their_durations_are_counted(client: TestClient) -> None:

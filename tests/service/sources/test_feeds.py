@@ -447,6 +447,33 @@ def test_housekeeping_deletes_what_is_old(core: Core, recording: Path) -> None:
     core.close()
 
 
+def test_a_vehicle_that_is_deleted_while_its_recording_is_read_does_not_come_back(
+    client: TestClient, core: Core, csv_engine: Engine, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core.pipeline.process("bus-7", [make_window(csv_engine.system, 0)])
+    begun, go, keep = threading.Event(), threading.Event(), core.pipeline.keep
+
+    def held(*given: Any) -> Any:
+        begun.set()
+        assert go.wait(20)
+        return keep(*given)
+
+    monkeypatch.setattr(core.pipeline, "keep", held)
+    job = upload(client, recording, vehicle="bus-7").json()
+    assert begun.wait(20)
+    answers: list[int] = []
+    deleting = threading.Thread(
+        target=lambda: answers.append(client.delete("/vehicles/bus-7?confirm=bus-7").status_code)
+    )
+    deleting.start()
+    assert finished(client, job)["error"].startswith("cancelled")
+    go.set()
+    deleting.join(20)
+    assert answers == [204]
+    assert client.get("/vehicles/bus-7").status_code == 404
+    assert list(core.settings.uploads.iterdir()) == [] and client.get("/recordings").json()["recordings"] == []
+
+
 def test_no_recent_samples_is_reported(core: Core) -> None:
     with pytest.raises(UserError, match="no recent samples"):
         core.diagnoses.from_excerpt("nobody")

@@ -1,0 +1,56 @@
+"""Whose turn it is to write, and what becomes of those who wait behind a transaction that does not end."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import ExitStack
+
+import pytest
+from sqlalchemy.exc import SQLAlchemyError
+
+from sprung.service.store import turns as module
+from sprung.service.store.turns import Turns
+from tests.service_fakes import eventually
+
+
+def test_behind_a_transaction_that_does_not_end_only_few_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each holds one of the threads that answer requests."""
+    monkeypatch.setattr(module, "LOOK_SECONDS", 0.01)
+    monkeypatch.setattr(module, "STUCK_SECONDS", 0.05)
+    turns, refused, wrote = Turns(1), threading.Semaphore(0), threading.Semaphore(0)
+
+    def write() -> None:
+        try:
+            with turns.turn():
+                wrote.release()
+        except SQLAlchemyError:
+            refused.release()
+
+    threads = [threading.Thread(target=write) for _ in range(20)]
+    with turns.turn():
+        for thread in threads:
+            thread.start()
+        for _ in range(20 - module.MOST_BEHIND):
+            assert refused.acquire(timeout=10)
+        eventually(lambda: sum(thread.is_alive() for thread in threads) == module.MOST_BEHIND)
+        with pytest.raises(SQLAlchemyError, match="have not ended"), turns.turn():
+            pass
+    for thread in threads:
+        thread.join(10)
+    assert [wrote.acquire(blocking=False) for _ in range(module.MOST_BEHIND + 1)] == [True] * module.MOST_BEHIND + [
+        False
+    ]
+
+
+def test_a_turn_that_does_not_come_in_time_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "LOOK_SECONDS", 0.01)
+    turns = Turns(2)
+    with ExitStack() as held:
+        held.enter_context(turns.turn())
+        held.enter_context(turns.turn())
+        with pytest.raises(SQLAlchemyError), turns.turn(0.02):
+            pass
+    with turns.turn(0.0), pytest.raises(ZeroDivisionError), turns.turn(0.0):
+        raise ZeroDivisionError
+    with turns.turn(0.0):
+        pass
