@@ -66,7 +66,7 @@ MOVED = {  # modules by their present names, and the names under which rows were
         "amortised": ("estimator", "features", "training"),
     }.items()
     for module in modules
-}
+} | dict.fromkeys(("sprung.model.laws.motion", "sprung.model.laws.kinds"), "sprung.model.laws.base")
 
 _FULL_ALONE = "since 632f9976 what `full` draws is held against the first embeddings; `quick` holds it against no other"
 _MOVED_AWAY = "what log-ratios scale has a module of its own; the weights' folder is found from a folder below"

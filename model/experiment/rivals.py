@@ -9,7 +9,7 @@ import numpy as np
 from sprung.model.address import LawSetting, LawValue
 from sprung.model.identification.nonlinear.forces import LawAlongMotion
 from sprung.model.laws import ElementLaw, SpringDamper
-from sprung.model.laws.base import observe
+from sprung.model.laws.motion import observe
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System

@@ -2,25 +2,7 @@
 
 from __future__ import annotations
 
-from sprung.model.laws.base import (
-    CLOCK_LEAD,
-    COMPRESSION,
-    EXTENSION,
-    UNIT_ELEMENT,
-    BodyLaw,
-    ElementLaw,
-    Law,
-    Motion,
-    Observed,
-    ParameterSpec,
-    SensorLaw,
-    SpringDamper,
-    StructureLaw,
-    SupportLaw,
-    grid,
-    observe,
-    reversal_step,
-)
+from sprung.model.laws.base import COMPRESSION, EXTENSION, ElementLaw, ParameterSpec, grid
 from sprung.model.laws.bodies import EXTERNAL_FORCE, FLEXIBLE_MODE, MASS_CHANGE
 from sprung.model.laws.channel import SensorResponse
 from sprung.model.laws.damping import (
@@ -34,7 +16,9 @@ from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
 from sprung.model.laws.friction import DAHL, LUGRE, STRIBECK
 from sprung.model.laws.gas import GAS_SPRING, PRELOAD
 from sprung.model.laws.hysteresis import AIR_SPRING, BOUC_WEN, SERIES_STIFFNESS
+from sprung.model.laws.kinds import BodyLaw, Law, SensorLaw, StructureLaw, SupportLaw
 from sprung.model.laws.lost_motion import FRICTION_BACKLASH, PINCHED_HYSTERESIS
+from sprung.model.laws.motion import CLOCK_LEAD, UNIT_ELEMENT, Motion, Observed, SpringDamper, observe, reversal_step
 from sprung.model.laws.own import LawFileError, load_laws
 from sprung.model.laws.running_gear import ANTI_ROLL_BAR, RAIL_JOINTS, WHEEL_FLAT
 from sprung.model.laws.sensor_faults import (

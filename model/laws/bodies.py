@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.laws.base import BodyLaw, ParameterSpec, Values, grid
+from sprung.model.laws.base import ParameterSpec, Values, grid
+from sprung.model.laws.kinds import BodyLaw
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 

@@ -11,15 +11,13 @@ from sprung.model.laws.base import (
     RARE,
     ElementLaw,
     FittedElement,
-    Motion,
-    Observed,
     ParameterSpec,
     Restart,
-    SpringDamper,
     Values,
     grid,
     with_wider_form,
 )
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.signals import FloatArray
 
 

@@ -4,16 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.laws.base import (
-    CLOCK_LEAD,
-    ElementLaw,
-    Motion,
-    Observed,
-    ParameterSpec,
-    SpringDamper,
-    Values,
-    grid,
-)
+from sprung.model.laws.base import ElementLaw, ParameterSpec, Values, grid
+from sprung.model.laws.motion import CLOCK_LEAD, Motion, Observed, SpringDamper
 from sprung.model.signals import FloatArray
 
 _CHANGE = ParameterSpec(  # a larger change is rather a wrong value of the file

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import ElementLaw, ParameterSpec, Values, grid
+from sprung.model.laws.motion import CLOCK_LEAD, Motion, Observed, SpringDamper
 from sprung.model.signal_filters import lfilter_from, lfilter_zi
 from sprung.model.signals import FloatArray
 

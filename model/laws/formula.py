@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, no_memory
+from sprung.model.laws.base import ElementLaw, ParameterSpec, Values, no_memory
 from sprung.model.laws.expression import MOTION, Expression, FormulaError, parse
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 
 EFFECT = "formula"
 _ANY = 1e18

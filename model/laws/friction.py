@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import RARE, ElementLaw, ParameterSpec, Values, grid
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.laws.paths import presliding_path
 from sprung.model.signals import FloatArray
 

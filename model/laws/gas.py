@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import RARE, ElementLaw, ParameterSpec, Values, grid
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.signals import FloatArray
 
 _SHORTEST = 0.02  # of the gas column: nearer to its bottom the formula is no gas

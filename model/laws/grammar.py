@@ -15,8 +15,9 @@ from itertools import product
 
 import numpy as np
 
-from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import RARE, ElementLaw, ParameterSpec, Values, grid
 from sprung.model.laws.formula import formula_law
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.signal_filters import lfilter_from
 from sprung.model.signals import FloatArray
 

@@ -11,15 +11,13 @@ from sprung.model.laws.base import (
     ElementLaw,
     FittedElement,
     Maxwell,
-    Motion,
-    Observed,
     ParameterSpec,
     Restart,
-    SpringDamper,
     Values,
     grid,
     with_wider_form,
 )
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.laws.paths import maxwell_path
 from sprung.model.laws.reversals import GAMMA, bouc_wen_memory
 from sprung.model.signals import FloatArray

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sprung.model.laws.base import BodyLaw, Law, StructureLaw, Values
+from sprung.model.laws.base import Values
+from sprung.model.laws.kinds import BodyLaw, Law, StructureLaw
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.laws.structure import sites_of
 from sprung.model.mechanics import Mechanics

@@ -4,17 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.laws.base import (
-    RARE,
-    ElementLaw,
-    Motion,
-    Observed,
-    ParameterSpec,
-    SpringDamper,
-    Values,
-    grid,
-    with_wider_form,
-)
+from sprung.model.laws.base import RARE, ElementLaw, ParameterSpec, Values, grid, with_wider_form
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.laws.paths import stop_path
 from sprung.model.laws.reversals import GAMMA, bouc_wen_memory
 from sprung.model.signals import FloatArray

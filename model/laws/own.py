@@ -5,7 +5,7 @@ from __future__ import annotations
 import runpy
 from pathlib import Path
 
-from sprung.model.laws.base import Law
+from sprung.model.laws.kinds import Law
 
 
 class LawFileError(ValueError):

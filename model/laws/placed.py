@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 
 from sprung.model.address import LawSetting, LawValue
 from sprung.model.laws import CATALOGUE
-from sprung.model.laws.base import BodyLaw, ElementLaw, Law, SensorLaw, SpringDamper, StructureLaw, SupportLaw
+from sprung.model.laws.base import ElementLaw
 from sprung.model.laws.expression import FormulaError
 from sprung.model.laws.formula import EFFECT, formula_law, without_force
+from sprung.model.laws.kinds import BodyLaw, Law, SensorLaw, StructureLaw, SupportLaw
+from sprung.model.laws.motion import SpringDamper
 from sprung.model.schema import GROUND, Element, SupportInput, SystemFile
 
 _BESIDE = ("with", "variant", "formula", "memory")  # keys of a law that are no parameters

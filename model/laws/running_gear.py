@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.laws.base import (
-    RARE,
-    ElementLaw,
-    Motion,
-    ParameterSpec,
-    SpringDamper,
-    SupportLaw,
-    Values,
-    Where,
-    grid,
-)
+from sprung.model.laws.base import RARE, ElementLaw, ParameterSpec, Values, Where, grid
+from sprung.model.laws.kinds import SupportLaw
+from sprung.model.laws.motion import Motion, SpringDamper
 from sprung.model.signals import FloatArray
 
 _COUNT = 8  # harmonics of a dip

@@ -11,9 +11,10 @@ from itertools import product
 
 import numpy as np
 
-from sprung.model.laws.base import UNIT_ELEMENT, ElementLaw, Motion, Observed, ParameterSpec
+from sprung.model.laws.base import ElementLaw, ParameterSpec
 from sprung.model.laws.formula import formula_law
 from sprung.model.laws.grammar import DECAYS, filtered
+from sprung.model.laws.motion import UNIT_ELEMENT, Motion, Observed
 from sprung.model.signals import FloatArray
 
 _TRIED = (0.5, 1.0, 2.0)  # factors on saved values of nonlinear parameters

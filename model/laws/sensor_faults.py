@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from sprung.model.laws.base import RARE, ParameterSpec, SensorLaw
+from sprung.model.laws.base import RARE, ParameterSpec
 from sprung.model.laws.channel import SensorResponse
+from sprung.model.laws.kinds import SensorLaw
 
 OF_CHANNEL = "unit of the channel"  # of a parameter
 _SECONDS = ParameterSpec("time", "s", -1.0, 1.0, "delay of the signal; negative: early", lambda seen: 0.005)

@@ -21,7 +21,8 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize
 
-from sprung.model.laws.base import ElementLaw, Motion, ParameterSpec, SpringDamper, Values
+from sprung.model.laws.base import ElementLaw, ParameterSpec, Values
+from sprung.model.laws.motion import Motion, SpringDamper
 from sprung.model.signals import FloatArray
 
 _INTERVALS = (10, 8)  # of the splines over deflection and rate

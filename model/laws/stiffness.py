@@ -12,15 +12,13 @@ from sprung.model.laws.base import (
     EXTENSION,
     RARE,
     ElementLaw,
-    Motion,
-    Observed,
     ParameterSpec,
     Restatement,
-    SpringDamper,
     Values,
     grid,
     with_wider_form,
 )
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.signals import FloatArray
 
 

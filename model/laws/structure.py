@@ -10,8 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.laws.base import RARE, Foothold, Observed, ParameterSpec, StructureLaw, Values
+from sprung.model.laws.base import RARE, ParameterSpec, Values
 from sprung.model.laws.bodies import columns_of, with_element
+from sprung.model.laws.kinds import Foothold, StructureLaw
+from sprung.model.laws.motion import Observed
 from sprung.model.mechanics import Mechanics
 from sprung.model.schema import GROUND, SystemFile
 from sprung.model.signals import FloatArray

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper, Values
+from sprung.model.laws.base import ElementLaw, Values
+from sprung.model.laws.motion import CLOCK_LEAD, Motion, SpringDamper
 from sprung.model.signals import FloatArray
 
 _At = tuple[FloatArray, FloatArray, float]  # deflection, rate, time

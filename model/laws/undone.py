@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sprung.model.laws.base import SensorLaw
+from sprung.model.laws.kinds import SensorLaw
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
 

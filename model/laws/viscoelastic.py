@@ -21,19 +21,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.laws.base import (
-    RARE,
-    ElementLaw,
-    Foothold,
-    Maxwell,
-    Motion,
-    Observed,
-    ParameterSpec,
-    SpringDamper,
-    StructureLaw,
-    Values,
-    grid,
-)
+from sprung.model.laws.base import RARE, ElementLaw, Maxwell, ParameterSpec, Values, grid
+from sprung.model.laws.kinds import Foothold, StructureLaw
+from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.mechanics import Mechanics
 from sprung.model.signal_filters import lfilter_from
 from sprung.model.signals import FloatArray

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from sprung.model.laws.base import ElementLaw, Motion, SpringDamper, Values
+from sprung.model.laws.base import ElementLaw, Values
+from sprung.model.laws.motion import Motion, SpringDamper
 from sprung.model.laws.trajectory import MemoryStep
 from sprung.model.signals import FloatArray
 

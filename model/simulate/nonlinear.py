@@ -14,7 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
+from sprung.model.laws.base import ElementLaw
+from sprung.model.laws.motion import CLOCK_LEAD, Motion, SpringDamper
 from sprung.model.mechanics import ACCELERATION, FORCE, Mechanics
 from sprung.model.signal_filters import firwin, upfirdn
 from sprung.model.signals import FloatArray

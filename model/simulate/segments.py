@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.laws.base import Motion
+from sprung.model.laws.motion import Motion
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.etd import ForceSteps, March, Site, march
 

@@ -14,7 +14,7 @@ from sprung.model.laws import (
     find_law,
     observe,
 )
-from sprung.model.laws.base import CLOCK_LEAD, Motion
+from sprung.model.laws.motion import CLOCK_LEAD, Motion
 from sprung.model.laws.stiffness import CLEARANCE
 from sprung.model.laws.trajectory import along, phi
 from sprung.model.signals import FloatArray

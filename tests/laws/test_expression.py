@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from sprung.model.laws import CATALOGUE, ElementLaw
-from sprung.model.laws.base import Motion, SpringDamper
 from sprung.model.laws.expression import MOTION, FormulaError, parse
+from sprung.model.laws.motion import Motion, SpringDamper
 
 SEVERAL = {"fractional_stiffness"}  # memories, which no formula of one z tells
 WRITTEN = [law for law in CATALOGUE if isinstance(law, ElementLaw) and law.name not in SEVERAL]

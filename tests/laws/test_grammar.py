@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sprung.model.laws import SpringDamper, observe
-from sprung.model.laws.base import Motion
 from sprung.model.laws.basis import trials
 from sprung.model.laws.grammar import OF_DEFLECTION, OF_RATE, Factor, Shape, forms, formula_cost, law_of
+from sprung.model.laws.motion import Motion
 from sprung.model.laws.trajectory import along
 
 TIME = np.arange(2000) / 400

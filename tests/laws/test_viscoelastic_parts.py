@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sprung.model.laws import CATALOGUE, SpringDamper, StructureLaw
-from sprung.model.laws.base import Motion
 from sprung.model.laws.expression import MOTION, parse
+from sprung.model.laws.motion import Motion
 from tests.named_laws import element_law
 
 RUBBER = element_law("fractional_stiffness")
