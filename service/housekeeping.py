@@ -156,6 +156,10 @@ class Housekeeping:
             if not keep:
                 connection.rollback()
                 return forgotten
+        if (beyond := forgotten.too_many_bytes) > 0:
+            log.warning(
+                "the store is %.1f MB beyond SPRUNG_RETENTION_STORE_BYTES: no more windows can go", beyond / 1e6
+            )
         for name in forgotten.upload_files:
             (settings.uploads / name).unlink(missing_ok=True)
         return forgotten

@@ -89,6 +89,12 @@ def drop(connection: Connection, month: Month) -> int:
     return held
 
 
+def size(connection: Connection, month: Month) -> int:
+    """Bytes that a month takes, with its indexes."""
+    query = text("SELECT pg_total_relation_size(CAST(:name AS regclass))")
+    return int(connection.execute(query, {"name": month.name}).scalar_one())
+
+
 def insert_new(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) -> None:
     """Insert rows whose key is not there yet: by COPY where the database has it and it pays."""
     if connection.dialect.name != "postgresql" or len(rows) < COPY_FROM:

@@ -23,6 +23,8 @@ from sprung.service.store.work import ALARM_SOURCE, UNFINISHED
 CLOCK_WAS_SET_NS = 1_577_836_800_000_000_000  # 2020: before it, a clock was not set, and says nothing about age
 Keep = Callable[..., Any]  # of a connection and the conditions of windows
 AT_ONCE = 5000  # windows that are deleted together when there are too many
+FEWEST = 50  # likewise, where little room is missing: they fill some dozen pages, and single ones would free none
+WINDOW_BYTES = 1200  # of one in the store, about
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,7 @@ class RetentionResult:
     minutes: int
     upload_files: tuple[str, ...]  # names inside the upload folder, for the caller to delete
     windows_for_room: int = 0  # of the windows, those that were not old
+    too_many_bytes: int = 0  # by which the store is too large though no window is left to go
 
 
 def forget(
@@ -55,8 +58,10 @@ def forget(
     """
     if connection.dialect.name == "postgresql":
         connection.execute(text("SET LOCAL statement_timeout = 0"))  # a month of a fleet takes its time
-    removed = _forget_windows(connection, limits.windows_before, keep)
-    for_room = 0 if limits.store_bytes is None else _make_room(connection, limits.store_bytes, keep)
+    removed, freed = _forget_windows(connection, limits.windows_before, keep)
+    for_room = beyond = 0
+    if limits.store_bytes is not None:
+        for_room, beyond = _make_room(connection, limits.store_bytes + freed, keep)
     minutes = delete(rollups).where(
         rollups.c.resolution_s == 60,
         rollups.c.updated_ns < limits.minutes_before,
@@ -75,15 +80,18 @@ def forget(
     files = _old_uploads(connection, limits.uploads_before)
     if limits.upload_bytes is not None:
         files += _surplus_uploads(connection, limits.upload_bytes)
-    return RetentionResult(removed + for_room, removed_minutes, tuple(files), for_room)
+    return RetentionResult(removed + for_room, removed_minutes, tuple(files), for_room, beyond)
 
 
-def _forget_windows(connection: Connection, before: int, keep: Keep) -> int:
+def _forget_windows(connection: Connection, before: int, keep: Keep) -> tuple[int, int]:
+    """Windows that went, and bytes that they took of which the database does not show yet that they are free."""
     if connection.dialect.name == "postgresql":
-        return sum(_drop(connection, month, keep) for month in old_months(connection, before))
-    old = (windows.c.stored_ns < before, windows.c.stored_ns >= CLOCK_WAS_SET_NS, windows.c.start_ns < before)
-    keep(connection, *old)
-    return connection.execute(delete(windows).where(*old)).rowcount
+        old = old_months(connection, before)
+        freed = sum(partitions.size(connection, month) for month in old)
+        return sum(_drop(connection, month, keep) for month in old), freed
+    which = (windows.c.stored_ns < before, windows.c.stored_ns >= CLOCK_WAS_SET_NS, windows.c.start_ns < before)
+    keep(connection, *which)
+    return connection.execute(delete(windows).where(*which)).rowcount, 0
 
 
 def _drop(connection: Connection, month: partitions.Month, keep: Keep) -> int:
@@ -124,30 +132,36 @@ def used_bytes(connection: Connection) -> int | None:
     return (pages - free) * size
 
 
-def _make_room(connection: Connection, limit: int, keep: Keep) -> int:
+def _make_room(connection: Connection, limit: int, keep: Keep) -> tuple[int, int]:
+    """Windows that went, and bytes by which the store is too large all the same."""
     if connection.dialect.name == "postgresql":
         return _drop_for_room(connection, limit, keep)
     removed = 0
     while (used := used_bytes(connection)) is not None and used > limit:
-        starts = select(windows.c.start_ns).order_by(windows.c.start_ns).limit(AT_ONCE).subquery()
+        enough = min(max((used - limit) // WINDOW_BYTES, FEWEST), AT_ONCE)
+        starts = select(windows.c.start_ns).order_by(windows.c.start_ns).limit(enough).subquery()
         last = connection.execute(select(func.max(starts.c.start_ns))).scalar()
         if last is None:
-            break
+            return removed, used - limit
         oldest = windows.c.start_ns <= last
         keep(connection, oldest)
         count = connection.execute(delete(windows).where(oldest)).rowcount
         removed += count
-    return removed
+    return removed, 0
 
 
-def _drop_for_room(connection: Connection, limit: int, keep: Keep) -> int:
-    """Whole months, the oldest first; never the newest one."""
-    removed = 0
+def _drop_for_room(connection: Connection, limit: int, keep: Keep) -> tuple[int, int]:
+    """Whole months, the oldest first; never the newest one.
+
+    The database has the room of a dropped table back, and shows it, only when the transaction is committed.
+    """
+    removed, beyond = 0, (used_bytes(connection) or 0) - limit
     for month in partitions.months(connection)[:-1]:
-        if (used_bytes(connection) or 0) <= limit:
+        if beyond <= 0:
             break
+        beyond -= partitions.size(connection, month)
         removed += _drop(connection, month, keep)
-    return removed
+    return removed, max(beyond, 0)
 
 
 def _old_uploads(connection: Connection, before: int) -> list[str]:

@@ -159,7 +159,35 @@ def test_a_store_that_is_too_large_loses_its_oldest_windows(
         found = retention.forget(connection, retention.RetentionLimits(0, 0, 0, store_bytes=used - 50_000))
         left = connection.execute(select(func.min(windows.c.start_ns))).scalar_one()
     assert 0 < found.windows == found.windows_for_room < 200
+    assert found.too_many_bytes == 0
     assert left == START + found.windows * 500_000_000  # the oldest went
+
+
+def test_a_store_that_is_too_large_without_any_window_is_told_of(
+    engine: Engine,
+    store: Store,
+    compute: Compute,
+    system: System,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    fill(engine, store, compute, system, START)
+    housekeeping = Housekeeping(Settings(data_dir=tmp_path, retention_store_bytes=1000), store)
+    found = housekeeping.once(START)
+    assert stored(store) == 0 and found.too_many_bytes > 0
+    assert "beyond SPRUNG_RETENTION_STORE_BYTES: no more windows can go" in caplog.text
+
+
+def test_a_store_that_is_slightly_too_large_loses_few_windows(
+    engine: Engine, store: Store, compute: Compute, system: System
+) -> None:
+    for first in range(0, 200, 20):
+        fill(engine, store, compute, system, START, first)
+    with store.write() as connection:
+        used = retention.used_bytes(connection)
+        assert used is not None
+        found = retention.forget(connection, retention.RetentionLimits(0, 0, 0, store_bytes=used - 10_000))
+    assert 0 < found.windows <= 2 * retention.FEWEST
 
 
 def test_uploads_make_room_oldest_first(store: Store) -> None:

@@ -241,8 +241,34 @@ def test_the_oldest_windows_make_room(any_store: Store) -> None:
         assert used is not None
         forgotten = retention.forget(connection, retention.RetentionLimits(0, 0, 0, store_bytes=used - 1))
         left = connection.execute(select(func.count()).select_from(windows)).scalar_one()
-    assert forgotten.windows_for_room >= 300
+    assert forgotten.windows_for_room >= (300 if any_store.many_writers else 1)
     assert left == 301 - forgotten.windows_for_room
+
+
+def test_of_months_that_make_room_no_more_go_than_are_needed(postgres: PostgresServer) -> None:
+    store = open_store(postgres.database())
+    fill(store, [record(month * 61 * DAY // HOP + i) for month in range(3) for i in range(100)])
+    with store.write() as connection:
+        used = retention.used_bytes(connection)
+        assert used is not None
+        forgotten = retention.forget(connection, retention.RetentionLimits(0, 0, 0, store_bytes=used - 1))
+        left = [month.name for month in partitions.months(connection)]
+    store.close()
+    assert forgotten.windows_for_room == 100
+    assert left == ["windows_2026_11", "windows_2027_01"]
+
+
+def test_months_that_are_old_have_made_room_already(postgres: PostgresServer) -> None:
+    """PostgreSQL shows the room of a dropped table only after the commit."""
+    store = open_store(postgres.database())
+    fill(store, [record(month * 61 * DAY // HOP + i) for month in range(3) for i in range(100)], stored_ns=START)
+    with store.write() as connection:
+        used = retention.used_bytes(connection)
+        assert used is not None
+        limits = retention.RetentionLimits(START + 40 * DAY, 0, 0, store_bytes=used - 1)
+        forgotten = retention.forget(connection, limits)
+    store.close()
+    assert (forgotten.windows, forgotten.windows_for_room) == (100, 0)
 
 
 def test_months_are_partitions_made_when_they_are_needed(postgres: PostgresServer) -> None:
