@@ -130,7 +130,7 @@ class _ReferenceRide:
         self.model, self.at, self.data, self.measured = model, at, data, measured
         self.sensitivity = DeviationSensitivity(model)
         self.second = model.chord(at, at.x, at.x0, data)
-        self.shown = model.by_drive(at, self.sensitivity.motions(data), data)
+        self.shown = model.sensitivities.by_drive(at, self.sensitivity.motions(data), data)
         columns, redundant = self.sensitivity.columns(at, self.second, data, self.shown)
         self.columns = as_rows(columns[..., :measured]).double()
         self.redundant = None if redundant is None else as_rows(redundant[..., :measured]).double()
@@ -146,12 +146,13 @@ class _ReferenceRide:
         """Gradient (U,) of the log-likelihood by parameters, loads and unknown deviations, for additional sensor
         signals `more` (B, T, S); summed over the windows."""
         at, model = self.at, self.model
-        r = as_rows(at.whiten @ model.spectra(more @ model.compression.matrix(self.data.present).mT).unsqueeze(3)).mT
+        shown = more @ model.compression.matrix(self.data.present).mT
+        r = as_rows(at.whiten @ model.band.spectra(shown).unsqueeze(3)).mT
         left = r - at.free.mT @ torch.cholesky_solve(at.free @ r, at.factor)
         gradient = self.columns @ left
         if self.redundant is not None:
-            over = model.spectra(more @ self.sensitivity.dropped(self.data.present).mT)
-            gradient = gradient + self.redundant @ as_rows((model.weight[:, None] * over).unsqueeze(3)).mT
+            over = model.band.spectra(more @ self.sensitivity.dropped(self.data.present).mT)
+            gradient = gradient + self.redundant @ as_rows((model.noise.weight[:, None] * over).unsqueeze(3)).mT
         return torch.cat([at.sensitivities @ left, gradient], dim=1).squeeze(2).sum(dim=0).numpy()
 
     def information(self) -> FloatArray:

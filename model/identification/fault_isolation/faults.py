@@ -16,14 +16,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from sprung.model.identification.fault_isolation.contradictions import Contradictions, Rearrangement, rearrangements
 from sprung.model.identification.fault_isolation.corrections import MARGIN, Corrections
 from sprung.model.identification.fault_isolation.steps import EVIDENT, DeviationSteps
 from sprung.model.identification.fault_isolation.stuck import STUCK, StuckChannels
-from sprung.model.identification.likelihood.gauss_newton import WindowBatch
-from sprung.model.identification.likelihood.linearise import as_rows
 from sprung.model.identification.measurements.deviations import clock_groups
 from sprung.model.identification.refinement.any_inputs import RefinerOfAnyInputs
 from sprung.model.identification.refinement.nominal import nominal_cost
@@ -427,36 +424,3 @@ class Explainer:
         costs = nominal_cost(self.refiner(self.samples), restored)
         order = np.argsort(costs[1:])
         return [tries[i] for i in order[:_TRIALS] if costs[1 + i] < _BETTER * costs[0]]
-
-    def _nominal_cost(self, windows: FloatArray) -> FloatArray:
-        """Weighted squares at the nominal values with the best initial state, (B,)."""
-        of_any = self.refiner(windows.shape[1])
-        lost = of_any.lacks(windows[:1])[0]
-        refiner = of_any.without(lost)
-        model, windows = refiner.model, windows.copy()
-        windows[:, :, np.flatnonzero(lost)] = 0.0
-        present: BoolArray = np.asarray(~np.isnan(windows[0, :, len(self.system.inputs) :]).any(axis=0))
-        with torch.no_grad():
-            data = model.batch(model.knots(windows), windows, present)
-            nominal = torch.zeros(1, len(model.system.parameters), dtype=torch.float64)
-            at = model.linearise(nominal, WindowBatch(data.w[:1], data.measured[:1], present, data.inputs[:1]))
-            s = model.simulator
-            discrete = model.compressed(s.discretise(s.element_values(nominal)), data)
-            rest = torch.zeros(len(windows), discrete.Ad.shape[1], dtype=torch.float64)
-            every = type(discrete)(
-                *(
-                    part.expand(len(windows), -1, -1)
-                    for part in (discrete.Ad, discrete.G0, discrete.G1, discrete.C, discrete.D)
-                )
-            )
-            residual = (
-                data.measured @ model.compression.matrix(present).mT
-                - s.states(every, data.w, rest) @ discrete.C.mT
-                - data.w @ discrete.D.mT
-            )
-            r = as_rows(at.whiten @ model.spectra(residual).unsqueeze(3))[:, 0]  # (B, K)
-            along = r @ at.free[0].mT  # (B, N)
-            left = r.square().sum(dim=1) - (along * torch.cholesky_solve(along.mT, at.factor[0]).mT).sum(dim=1)
-            dropped = refiner.calibration.dropped(present)
-            over = model.spectra(data.measured @ dropped.mT) * model.weight[:, None]
-            return np.asarray((left + over.abs().square().sum(dim=(1, 2))).numpy())

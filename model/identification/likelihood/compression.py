@@ -47,6 +47,11 @@ class Compression:
             self._matrices[key] = torch.as_tensor(np.concatenate(blocks))
         return self._matrices[key]
 
+    def rows(self, present: BoolArray, kind: torch.dtype) -> Tensor:
+        """The matrix over all sensors, (R, S); zero columns for absent ones."""
+        select = torch.eye(len(present), dtype=kind)[present]
+        return self.matrix(present).to(kind) @ select
+
     def open_degrees(self, kind: IntArray) -> IntArray:
         """Highest power of time that the motion of an integrated support leaves open in sensors of a kind.
 

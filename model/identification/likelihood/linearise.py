@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sprung.model.identification.likelihood.band import ComparedBand
 from sprung.model.identification.likelihood.compression import Compression
 from sprung.model.identification.likelihood.frequency import FrequencyModel, bin_frequencies
 from sprung.model.identification.likelihood.gauss_newton import Chord, Linearisation, Transfer, WindowBatch
-from sprung.model.mechanics import DEFLECTION, FORCE
+from sprung.model.identification.likelihood.noise import WindowNoise
+from sprung.model.identification.likelihood.sensitivities import WindowSensitivities
+from sprung.model.mechanics import FORCE
 from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.simulate.drives import drives_of
 from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator
-from sprung.model.simulate.loading import by_inertia, load_terms
+from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
@@ -26,9 +28,7 @@ PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any inform
 # service is within it but for what is failing, while a weak window's own maximum is far off along what it hardly shows.
 HELD_STD = 0.2
 _RIDGE = 1e-11  # relative, on the normalised free responses
-_TOLD = 0.01  # of the motion that a lost input may have at most: what it is believed to move by, where it is told
 _SHOWN = 1e-6  # relative ridge on free responses that hardly show where drives are lost
-_APART = 1e-6  # of the largest, below which what a lost input brings to the signals is no direction of its own
 _SETTLING = 2  # times that initial states and the motion of lost inputs are made to fit each other
 _UNSEEN = 1e-10  # of the largest free response: below is rounding; those that are seen differ by 1e-4, units included
 
@@ -61,17 +61,15 @@ class WindowModel:
         self.system, self.samples = system, samples
         self.simulator = LinearSimulator(system)
         omega = bin_frequencies(samples, system.sample_rate)
-        # The mean is left out: every signal may have an offset (gravity, curves, drifting electronics).
-        self.bins = int(np.searchsorted(omega, 2 * np.pi * BAND * system.sample_rate, side="right")) - 1
-        self.frequency = FrequencyModel(self.simulator, omega[1 : self.bins + 1])
-        self.weight = torch.full((self.bins,), np.sqrt(2 / samples), dtype=torch.float64)
-        self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
+        bins = int(np.searchsorted(omega, 2 * np.pi * BAND * system.sample_rate, side="right")) - 1
+        self.frequency = FrequencyModel(self.simulator, omega[1 : bins + 1])
+        self.band = ComparedBand(samples, bins, self.frequency.jw.dtype)
         self.input_noise = np.array([channel.noise or USUAL_NOISE[channel.unit] for channel in system.inputs])
         self.compression = Compression(system, samples)
         lost = np.array([drive.lost for drive in drives_of(system)], dtype=bool)
-        self.lost = int(lost.sum())  # drives that are not measured at all
-        self.lost_at = torch.as_tensor(np.flatnonzero(lost))
-        self.instrument_noise = self.drive_noise * torch.as_tensor(~lost)  # without what is not measured at all
+        drives = torch.as_tensor(self.frequency.drive_noise())
+        self.noise = WindowNoise(drives, torch.as_tensor(lost), self.band.weight)
+        self.sensitivities = WindowSensitivities(self.frequency, self.compression, self.band)
         self.blind = self._blind(lost)
         self._taken: dict[bytes, int] = {}
         self.precision = torch.as_tensor(prior_std(system) ** -2)
@@ -110,14 +108,14 @@ class WindowModel:
 
     def _directions_lost(self, present: BoolArray) -> int:
         """Complex numbers of a window's signals that the motion of lost inputs takes, at nominal values."""
-        if not self.lost:
+        if not self.noise.lost:
             return 0
         key = present.tobytes()
         if key not in self._taken:
             nothing = torch.zeros(1, 0, present.sum(), dtype=torch.float64)
             values = self.simulator.element_values(torch.zeros(1, len(self.system.parameters), dtype=torch.float64))
             drive = self.transfer(values, WindowBatch(nothing, nothing, present, nothing)).drive
-            self._taken[key] = int(self._span(drive * self.drive_noise[:, None]).abs().square().sum().round())
+            self._taken[key] = int(self.noise.span(self.noise.carried(drive)).abs().square().sum().round())
         return self._taken[key]
 
     def _open(self, free: Tensor, data: WindowBatch) -> Tensor:
@@ -134,31 +132,26 @@ class WindowModel:
         linearised, is that with these inputs: the most likely one of a moderate size, since where sensors hardly show
         it, noise would otherwise make it a wild one.
         """
-        if not self.lost:
+        if not self.noise.lost:
             return data
         return replace(data, w=self._with_noise(data.w, self._of_lost(self._residual(x, data), data)))
 
     def _of_lost(self, at: _Residual, data: WindowBatch) -> Tensor:
         """What the spectra of lost drives are more, (B, F, W/2), than in the windows that left a residual."""
         assert at.unweighed is not None
-        lost, told = self._told()
-        carried = at.carried * told[:, None]
-        whiten = self._by_noise(carried)
-        before = self.spectra(data.w[:, :, 0::2]) * lost
+        lost, believed = self.noise.believed(self.frequency.jw.dtype)
+        carried = at.carried * believed[:, None]
+        whiten = self.noise.by_noise(carried)
+        before = self.band.spectra(data.w[:, :, 0::2]) * lost
         shown = at.unweighed + at.transfer.drive @ before.unsqueeze(3)
-        return self.noise_told(whiten, carried, whiten @ shown) * told * lost - before
-
-    def _told(self) -> tuple[Tensor, Tensor]:
-        """Which drives are lost, and how far what is told of them is believed, each (F, W/2)."""
-        lost = self.drive_noise != self.instrument_noise
-        return lost.to(self.frequency.jw.dtype), torch.where(lost, _TOLD, 1.0)
+        return self.noise.estimated(whiten, carried, whiten @ shown) * believed * lost - before
 
     def _moving(self, carried: Tensor, residual: Tensor, free: Tensor) -> Tensor:
         """First states (B, N') with which windows move while drives are lost: also those that only lost drives show.
 
         residual (B, F, R, 1) and free responses (B, F, R, N'), as spectra of the signals.
         """
-        whiten = self._by_noise(carried * self._told()[1][:, None])
+        whiten = self.noise.by_noise(carried * self.noise.believed(self.frequency.jw.dtype)[1][:, None])
         r, (basis, scale) = as_rows(whiten @ residual), normalised(as_rows(whiten @ free))
         products = basis @ basis.mT + _SHOWN * torch.eye(basis.shape[1], dtype=basis.dtype)
         found: Tensor = torch.linalg.solve(products, basis @ r.mT).squeeze(2) / scale
@@ -169,15 +162,15 @@ class WindowModel:
 
         Motion of a lost input is told as a periodic one, and needs another initial state than none.
         """
-        for _ in range(_SETTLING if self.lost else 0):
+        for _ in range(_SETTLING if self.noise.lost else 0):
             data = self.with_lost(x, data)
-        return (self._residual(x, data).x0 if self.lost else x0), data
+        return (self._residual(x, data).x0 if self.noise.lost else x0), data
 
     def _with_noise(self, w: Tensor, noise: Tensor) -> Tensor:
         """Knots (B, T, W) to which what the spectra (B, F, W/2) say is added."""
         w = w.clone()
-        w[:, :, 0::2] += self.signals(noise)
-        w[:, :, 1::2] += self.signals(self.frequency.jw[:, None] * noise)
+        w[:, :, 0::2] += self.band.signals(noise)
+        w[:, :, 1::2] += self.band.signals(self.frequency.jw[:, None] * noise)
         return w
 
     def _residual(self, x: Tensor, data: WindowBatch) -> _Residual:
@@ -190,9 +183,9 @@ class WindowModel:
         free = self._open(s.free_response(discrete, self.samples), data)
 
         transfer = self.transfer(values, data)
-        carried = transfer.drive * self.drive_noise[:, None]
-        whiten = self.whitening(carried)
-        plain, plain_free = self.spectra(residual).unsqueeze(3), self.spectra(free)
+        carried = self.noise.carried(transfer.drive)
+        whiten = self.noise.whitening(carried)
+        plain, plain_free = self.band.spectra(residual).unsqueeze(3), self.band.spectra(free)
         white_residual, white_free = whiten @ plain, whiten @ plain_free  # (B, F, R, 1), (B, F, R, N)
         r, basis = as_rows(white_residual), as_rows(white_free)  # (B, 1, K), (B, N, K)
         basis, free_scale = normalised(basis)
@@ -205,7 +198,7 @@ class WindowModel:
         initial = x0[:, None, :, None].to(white_free.dtype)
         left = white_residual - white_free @ initial
         unweighed = None
-        if self.lost:
+        if self.noise.lost:
             x0 = self._moving(carried, plain, plain_free)
             unweighed = plain - plain_free @ x0[:, None, :, None].to(plain_free.dtype)
         x0 = x0[:, : discrete.Ad.shape[1]]
@@ -230,15 +223,16 @@ class WindowModel:
     def linearise(self, x: Tensor, data: WindowBatch) -> Linearisation:
         """Everything at log-ratios x (B, P)."""
         s, at = self.simulator, self._residual(x, data)
-        noise = self.noise_told(at.whiten, at.carried, at.left)
-        if self.lost:
+        noise = self.noise.estimated(at.whiten, at.carried, at.left)
+        if self.noise.lost:
             noise = noise + self._of_lost(at, data)
         moved = self.moved_by(at.values, at.transfer.compliance, noise)
         states = at.forced + s.free_states(at.discrete, at.x0, self.samples)
-        J = as_rows(self._by_unknowns(x.shape[1], at.values, at.transfer, at.whiten, states, data, moved))
+        J = as_rows(self.sensitivities.by_unknowns(x.shape[1], at.values, at.transfer, at.whiten, states, data, moved))
         across_products = at.basis @ J.mT
         across = torch.cholesky_solve(across_products, at.factor)
-        if self.lost or not data.present.all():  # of free responses that hardly show, differences of products cancel
+        # Of free responses that hardly show, differences of products cancel
+        if self.noise.lost or not data.present.all():
             left = J - across.mT @ at.basis
             information, gradient = left @ left.mT, (left @ at.r.mT).squeeze(2)
         else:
@@ -265,30 +259,6 @@ class WindowModel:
             step,
         )
 
-    def _by_unknowns(
-        self,
-        count: int,
-        values: ElementValues,
-        transfer: Transfer,
-        whiten: Tensor,
-        states: Tensor,
-        data: WindowBatch,
-        moved: tuple[Tensor, Tensor],
-    ) -> Tensor:
-        """Whitened sensitivities of the spectra to `count` unknowns: springs and dampers, masses, loads."""
-        s = self.simulator
-        J, by_load = self._sensitivities(values, whiten @ transfer.per_force, states, data, moved)
-        masses, none = s.m_of[s.m_of.any(dim=1)], s.loading.pattern[:0]
-        if len(masses):
-            none = none.new_zeros(len(masses), *none.shape[1:])
-            J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, (masses, none), moved[0])], dim=3)
-        loads = count - len(s.m_of)
-        if loads > 0:
-            terms = s.loading.exponents[:loads], s.loading.pattern[:loads]
-            of_load = self.by_inertia(values, transfer, whiten, states, data, terms, moved[0], s.loading.reach[:loads])
-            J = torch.cat([J, of_load if by_load is None else of_load + by_load[..., :loads]], dim=3)
-        return J
-
     def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> Chord:
         """One more step from (x, x0) with the products of `at`."""
         s = self.simulator
@@ -296,7 +266,7 @@ class WindowModel:
         states = s.states(discrete, data.w, x0)
         outputs = states @ discrete.C.mT + data.w @ discrete.D.mT
         error = data.measured - outputs
-        spectra = self.spectra(error @ self.compression.matrix(data.present).mT)
+        spectra = self.band.spectra(error @ self.compression.matrix(data.present).mT)
         r = as_rows(at.whiten @ spectra.unsqueeze(3)).mT  # (B, K, 1)
         along = at.free @ r
         free_part = torch.cholesky_solve(along, at.factor)
@@ -320,11 +290,6 @@ class WindowModel:
         states = s.states(discrete, data.w, x0)
         return states, states @ discrete.C.mT + data.w @ discrete.D.mT
 
-    def noise_told(self, whiten: Tensor, carried: Tensor, left: Tensor) -> Tensor:
-        """Noise of the drives (B, F, W/2) as estimated from a whitened residual (B, F, R, 1) without free responses."""
-        found: Tensor = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2
-        return found * self.drive_noise
-
     def moved_by(self, values: ElementValues, compliance: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Response to noise of the drives (B, F, W/2): coordinates (B, F, n), deflections by the supports (B, F, E)."""
         s, kind = self.simulator, compliance.dtype
@@ -346,7 +311,7 @@ class WindowModel:
             shown = shown + (direct @ noise[:, :, s.supports // 2].unsqueeze(3)).squeeze(3)
         w = self._with_noise(data.w, noise)
         present = torch.as_tensor(np.flatnonzero(data.present))
-        return replace(data, w=w), outputs + self.signals(shown[:, :, present])
+        return replace(data, w=w), outputs + self.band.signals(shown[:, :, present])
 
     def excitation(self, windows: FloatArray) -> FloatArray:
         """Mean power over bins of the strongest input of windows (B, T, C), over that of its noise, (B,).
@@ -357,55 +322,8 @@ class WindowModel:
         inputs = windows[:, :, : len(self.input_noise)]
         if not inputs.shape[2]:
             return np.full(len(windows), np.inf)
-        power = self.spectra(torch.as_tensor(inputs)).abs().square().mean(dim=1).numpy() / self.samples
+        power = self.band.spectra(torch.as_tensor(inputs)).abs().square().mean(dim=1).numpy() / self.samples
         return np.asarray(np.nan_to_num(power / self.input_noise**2, nan=0.0).max(axis=1))
-
-    def by_drive(self, at: Linearisation, motions: Sequence[tuple[Tensor, Tensor]], data: WindowBatch) -> list[Tensor]:
-        """Contribution of each drive to the whitened signals, without free responses, each (B, F, R, W/2).
-
-        motions: values and rates of the drives, each (B, T, W/2).  Over a finite window the spectrum of the rate is not
-        j w times that of the value.  In single precision.
-        """
-        s, kind = self.simulator, torch.complex64
-        values = s.element_values(at.x)
-        whiten = at.whiten.to(kind)
-        per_force = whiten @ at.transfer.per_force.to(kind)
-        k, c = ((v[:, None, :, None] * s.G).to(kind) for v in (values.stiffness, values.damping))  # (B, 1, E, supports)
-        found = []
-        for value, rate in motions:
-            U, V = (self.spectra(part).unsqueeze(2).to(kind) for part in (value, rate))  # (B, F, 1, W/2)
-            shown = per_force.new_zeros(*per_force.shape[:3], s.W // 2)
-            if len(s.supports):
-                columns = s.supports // 2
-                shown[..., columns] = per_force @ (k * U[..., columns] + c * V[..., columns])
-                if self.frequency.element_sensors:
-                    direct = torch.where((s.kind == DEFLECTION)[:, None], s.L, torch.zeros_like(s.L)) @ s.G
-                    seen = whiten @ (self.signal_rows(data, kind) @ direct.to(kind))
-                    shown[..., columns] += seen * U[..., columns]
-            if len(s.forces):
-                columns = s.forces // 2
-                shown[..., columns] = whiten @ (at.transfer.per_load.to(kind) @ s.F.to(kind)) * U[..., columns]
-            found.append(shown)
-        return found
-
-    def signal_rows(self, data: WindowBatch, kind: torch.dtype) -> Tensor:
-        """The compression as a matrix over all sensors, (R, S); zero columns for absent ones."""
-        select = torch.eye(len(data.present), dtype=kind)[data.present]
-        return self.compression.matrix(data.present).to(kind) @ select
-
-    def spectra(self, signals: Tensor) -> Tensor:
-        """Bins within the band of signals (B, T, ...), (B, F, ...)."""
-        if signals.numel() == 0:  # no redundant sensor: a transform of nothing is an error
-            return signals.new_zeros((len(signals), self.bins, *signals.shape[2:]), dtype=self.frequency.jw.dtype)
-        found: Tensor = torch.fft.rfft(signals, dim=1)[:, 1 : self.bins + 1]
-        return found
-
-    def signals(self, spectra: Tensor) -> Tensor:
-        """Signals (B, T, X) of bins within the band (B, F, X)."""
-        whole = spectra.new_zeros(len(spectra), self.samples // 2 + 1, spectra.shape[2])
-        whole[:, 1 : self.bins + 1] = spectra
-        found: Tensor = torch.fft.irfft(whole, n=self.samples, dim=1)
-        return found
 
     def _signals(self, data: WindowBatch) -> Tensor:
         return data.measured @ self.compression.matrix(data.present).mT
@@ -425,7 +343,7 @@ class WindowModel:
         s, f = self.simulator, self.frequency
         compliance = _inverse(f.stiffness(values))
         kind = compliance.dtype
-        Q = self.signal_rows(data, kind)
+        Q = self.compression.rows(data.present, kind)
         plain = not f.element_sensors and values.reach is None
         sensing = Q @ (f.motion_sensing if plain else f.sensing(values))
         per_load = sensing @ compliance
@@ -441,95 +359,6 @@ class WindowModel:
             forces = torch.where((s.kind == FORCE)[:, None], s.L, torch.zeros_like(s.L))
             per_force = per_force + Q @ forces.to(kind)
         return Transfer(compliance, per_load, per_force, drive)
-
-    def whitening(self, carried: Tensor) -> Tensor:
-        """Whitening matrices (B, F, R, R) where the drives' noise brings `carried` (B, F, R, W/2) to the signals.
-
-        What any motion of lost drives may bring to them is projected out.
-        """
-        if not self.lost:
-            return self._by_noise(carried)
-        measured = carried.clone()
-        measured[..., self.lost_at] = 0.0
-        whiten = self._by_noise(measured)
-        directions = self._span(whiten @ carried)
-        left: Tensor = whiten - directions @ (directions.mH @ whiten)
-        return left
-
-    def _span(self, carried: Tensor) -> Tensor:
-        """Orthonormal directions (B, F, R, X) that what lost drives bring to the signals spans; zero where fewer."""
-        u, size, _ = torch.linalg.svd(carried[..., self.lost_at], full_matrices=False)
-        seen = size > _APART * size.amax(dim=2, keepdim=True)
-        found: Tensor = u * seen.unsqueeze(2).to(u.dtype)
-        return found
-
-    def _by_noise(self, carried: Tensor) -> Tensor:
-        """Whitening matrices (B, F, R, R) for noise `carried` (B, F, R, W/2) beside that of the signals."""
-        R = carried.shape[2]
-        covariance = torch.eye(R, dtype=carried.dtype) + carried @ carried.mH
-        factor = torch.linalg.cholesky(covariance)
-        unit = torch.diag_embed(self.weight[:, None].expand(-1, R)).to(carried.dtype).expand_as(factor)
-        found: Tensor = torch.linalg.solve_triangular(factor, unit, upper=False)
-        return found
-
-    def _sensitivities(
-        self,
-        values: ElementValues,
-        per_force: Tensor,
-        states: Tensor,
-        data: WindowBatch,
-        moved: tuple[Tensor, Tensor],
-    ) -> tuple[Tensor, Tensor | None]:
-        """Whitened sensitivities to stiffnesses then dampings along the smoothed motion, (B, F, R, P'), and to loads
-        through the stiffnesses that follow them, (B, F, R, X); None: none does.
-
-        moved: what the residual says that the noise of the drives moves, see `moved_by`.
-        """
-        s = self.simulator
-        n = s.H.shape[1]
-        d = states[:, :, :n] @ s.H.T + data.w[:, :, s.supports] @ s.G.T
-        v = states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T
-        spectra = self.spectra(torch.cat([d, v], dim=2))
-        E = s.H.shape[0]
-        kind = per_force.dtype
-        of_noise = moved[0] @ s.H.T.to(kind) + moved[1]
-        deflection = (spectra[:, :, :E] + of_noise) * values.stiffness[:, None]
-        rate = (spectra[:, :, E:] + self.frequency.jw[:, None] * of_noise) * values.damping[:, None]
-        at, powers = s.element_of, s.loading.stiffness
-        return (
-            per_force[..., at] * (s.by_stiffness * deflection[..., at] + s.by_damping * rate[..., at]).unsqueeze(2),
-            (per_force * deflection.unsqueeze(2)) @ powers.T.to(kind) if bool(powers.any()) else None,
-        )
-
-    def by_inertia(
-        self,
-        values: ElementValues,
-        transfer: Transfer,
-        whiten: Tensor,
-        states: Tensor,
-        data: WindowBatch,
-        terms: tuple[Tensor, Tensor],
-        moved: Tensor,
-        reach: Tensor | None = None,
-    ) -> Tensor:
-        """Whitened sensitivities to masses and loads, exponents (X, n) and couplings (X, n, n), (B, F, R, X).
-
-        moved: what the noise of the drives moves of the coordinates, (B, F, n).  reach: (X, n), see `Loading.reach`.
-        """
-        s = self.simulator
-        A, b_value, b_rate = s.continuous(values)
-        n = s.H.shape[1]
-        acceleration = (
-            states @ A[:, n:].mT + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
-        )
-        smooth = self.spectra(acceleration) + self.frequency.jw[:, None] ** 2 * moved
-        force = by_inertia(smooth, values.mass, values.coupling, *terms)
-        found = -(whiten @ transfer.per_load) @ force
-        if reach is not None and bool(reach.any()):  # what accelerometers show of the angles themselves
-            at = torch.nonzero(reach)  # rows: a term, and its coordinate
-            Q = self.signal_rows(data, found.dtype) @ (s.S * self.frequency.accelerometers).to(found.dtype)
-            found[..., at[:, 0]] += (whiten @ Q[:, at[:, 1]]) * smooth[:, :, None, at[:, 1]]
-        return found
 
 
 def prior_std(system: System) -> FloatArray:

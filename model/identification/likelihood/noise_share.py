@@ -21,7 +21,7 @@ def noise_share(model: WindowModel, at: Linearisation, data: WindowBatch) -> Ten
     s = model.simulator
     values = s.element_values(at.x)
     transfer = model.transfer(values, data)
-    whiten = model.whitening(transfer.drive * model.drive_noise[:, None])
+    whiten = model.noise.whitening(model.noise.carried(transfer.drive))
     motion, direct = _motions(model, values, transfer, data)
     deflection = s.H.to(motion.dtype) @ motion + direct  # (B, F, E, Y)
     power = deflection.abs().square().sum(dim=3) * model.samples
@@ -50,8 +50,8 @@ def _motions(model: WindowModel, values: ElementValues, transfer: Transfer, data
     """
     of_drives, direct = moved_by_drives(model, values, transfer.compliance)
     kind = of_drives.dtype
-    of_sensors = torch.linalg.pinv(model.signal_rows(data, kind) @ model.frequency.sensing(values))
-    noise = model.instrument_noise[:, None]
+    of_sensors = torch.linalg.pinv(model.compression.rows(data.present, kind) @ model.frequency.sensing(values))
+    noise = model.noise.instruments[:, None]
     beside = (direct * noise).expand(*of_drives.shape[:2], *direct.shape)
     none = beside.new_zeros(*beside.shape[:3], of_sensors.shape[3])
     return torch.cat([of_drives * noise, of_sensors], dim=3), torch.cat([beside, none], dim=3)

@@ -136,7 +136,7 @@ class DeviationSensitivity:
         alone = torch.cholesky_solve(at.free @ after.residual, at.factor)  # (B, N, 1)
         step = after.step.unsqueeze(2)
         left = after.residual - at.free.mT @ (alone - at.across @ step) - at.sensitivities.mT @ step
-        noise = self.model.noise_told(at.whiten, carried, as_spectra(left, at.whiten))
+        noise = self.model.noise.estimated(at.whiten, carried, as_spectra(left, at.whiten))
         return self.model.smoothed(values, compliance, noise, data, after.outputs)
 
     def evidence(
@@ -166,7 +166,8 @@ class DeviationSensitivity:
         if redundant is not None:
             over = as_rows(redundant)
             dropped = self.dropped(data.present)
-            spectra = (self.model.weight[:, None] * self.model.spectra(data.measured @ dropped.mT)).to(torch.complex64)
+            weighted = self.model.noise.weight[:, None] * self.model.band.spectra(data.measured @ dropped.mT)
+            spectra = weighted.to(torch.complex64)
             information = information + over @ over.mT
             score = score + (over @ as_rows(spectra.unsqueeze(3)).mT)[..., 0].double()
         information = information.double()
@@ -179,7 +180,7 @@ class DeviationSensitivity:
 
     def bins(self, signals: Tensor) -> Tensor:
         """Weighed bins of signals (B, T, X), (B, F, X)."""
-        return self.model.weight[:, None] * self.model.spectra(signals)
+        return self.model.noise.weight[:, None] * self.model.band.spectra(signals)
 
     def _relative(self, information: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
         """Without what no record can identify: one gain, or one delay, that all channels share changes nothing."""
@@ -210,15 +211,15 @@ class DeviationSensitivity:
         for first, sign, shown in zip((0, C), (-1, 1), by_drive, strict=True):
             out[..., first : first + self.inputs] = sign * shown[..., self.drive] * share
         columns = self.inputs + torch.as_tensor(np.flatnonzero(data.present))
-        shown = model.spectra(after.outputs).to(kind)  # (B, F, S')
-        late = -model.spectra(self.slope @ after.outputs).to(kind)
+        shown = model.band.spectra(after.outputs).to(kind)  # (B, F, S')
+        late = -model.band.spectra(self.slope @ after.outputs).to(kind)
         by_sensor = (at.whiten @ model.compression.matrix(data.present).to(at.whiten.dtype)).to(kind)
         out[..., columns] = by_sensor * shown[:, :, None]
         out[..., C + columns] = by_sensor * late[:, :, None]
         dropped = self.dropped(data.present).to(kind)
         if not len(dropped):
             return out, None
-        dropped = dropped * model.weight[:, None, None].to(kind)
+        dropped = dropped * model.noise.weight[:, None, None].to(kind)
         over = torch.zeros(B, F, dropped.shape[1], self.measured, dtype=kind)
         over[..., columns] = dropped * shown[:, :, None]
         over[..., C + columns] = dropped * late[:, :, None]

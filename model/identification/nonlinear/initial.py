@@ -130,7 +130,7 @@ def _median_model(w: LawWindows, start: Iterate, data: WindowBatch) -> tuple[Lin
     point = start.take(torch.zeros(1, dtype=torch.long))
     steps = w.steps(replace(point, unknowns=start.unknowns.median(dim=0, keepdim=True).values), data)
     transfer = w.model.transfer(steps.values, data)
-    return steps, w.model.whitening(transfer.drive * w.model.drive_noise[:, None])
+    return steps, w.model.noise.whitening(w.model.noise.carried(transfer.drive))
 
 
 def _responses(w: LawWindows, steps: LinearStep, data: WindowBatch, whiten: Tensor, laws: list[int]) -> _Responses:
@@ -141,7 +141,7 @@ def _responses(w: LawWindows, steps: LinearStep, data: WindowBatch, whiten: Tens
     force[N:, :, laws] = torch.eye(T * len(laws), dtype=torch.float64).view(T * len(laws), T, len(laws))
     at_rest = replace(data, w=torch.zeros(X, *data.w.shape[1:], dtype=torch.float64))
     states, outputs = w.simulate(steps.take(torch.zeros(X, dtype=torch.long)), force, x0, at_rest)
-    shown = w.model.spectra(outputs @ w.model.compression.matrix(data.present).mT)
+    shown = w.model.band.spectra(outputs @ w.model.compression.matrix(data.present).mT)
     none: FloatArray = np.zeros((2, 1, 1, len(w.system.mechanics.stiffness)))
     d, v = (torch.as_tensor(part).permute(1, 2, 0) for part in w.site_motion(states, at_rest, none))
     return _Responses(as_rows(whiten @ shown.unsqueeze(3)).squeeze(1), d[:, laws], v[:, laws])

@@ -29,11 +29,11 @@ def input_noise_covariance(
     by_force, by_memory = tangent.adjoint(*_by_states_and_forces(w, by_signal, steps, present))
     by_deflection, by_rate = tangent.along_adjoint(by_force, by_memory)  # (B, T, L, U)
     jw = w.model.frequency.jw[:, None, None]
-    spectrum = w.model.spectra(by_deflection).conj() + jw * w.model.spectra(by_rate).conj()  # (B, F, L, U)
+    spectrum = w.model.band.spectra(by_deflection).conj() + jw * w.model.band.spectra(by_rate).conj()  # (B, F, L, U)
     moved, direct = moved_by_drives(w.model, steps.values, columns.compliance)
     site = w.weights.to(moved.dtype) @ (w.model.simulator.H.to(moved.dtype) @ moved + direct)  # (B, F, L, W/2)
     share = 2 / w.model.samples  # of a bin in a signal
-    through = share * (spectrum.mT @ site) * w.model.drive_noise[:, None]  # (B, F, U, W/2)
+    through = share * (spectrum.mT @ site) * w.model.noise.drives[:, None]  # (B, F, U, W/2)
     linear = by_signal.mH @ columns.carried
     both = ((linear + through / 2) @ through.mH).real.sum(dim=1) / share
     return both + both.mT
@@ -47,7 +47,7 @@ def _by_states_and_forces(
     by_signal: by bins of the compressed signals, (B, F, R, U).
     """
     B, _, R, U = by_signal.shape
-    signals = w.model.signals(by_signal.flatten(2)) * (w.model.samples / 2)
+    signals = w.model.band.signals(by_signal.flatten(2)) * (w.model.samples / 2)
     by_output = w.model.compression.matrix(present).mT @ signals.view(B, -1, R, U)  # (B, T, S', U)
     at_once = (steps.force_rows @ w.weights.T) - steps.direct @ w.pull.T  # (B, S', L)
     return steps.discrete.C.mT.unsqueeze(1) @ by_output, at_once.mT.unsqueeze(1) @ by_output

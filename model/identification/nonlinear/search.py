@@ -257,7 +257,7 @@ class LawSearch:
         identifiable, share = self._identifiable(found, torch.diagonal(covariance, dim1=1, dim2=2).sqrt())
         signals = len(w.model.compression.matrix(data.present))
         taken = self.states.shape[2] + len(w.memories) + identifiable.sum(dim=1)
-        freedom = 2 * w.model.bins * signals - taken
+        freedom = 2 * w.model.band.bins * signals - taken
         chi_square = self.cost / freedom.clamp_min(1)
         covariance = covariance * chi_square.clamp_min(1)[:, None, None]
         both = identifiable[:, :, None] & identifiable[:, None, :]

@@ -239,7 +239,7 @@ class LawWindows:
     def residual(self, outputs: Tensor, data: WindowBatch, whiten: Tensor) -> Tensor:
         """Whitened residual of simulated outputs (B, T, S'), (B, K, 1)."""
         compressed = (data.measured - outputs) @ self.model.compression.matrix(data.present).mT
-        return as_rows(whiten @ self.model.spectra(compressed).unsqueeze(3)).mT
+        return as_rows(whiten @ self.model.band.spectra(compressed).unsqueeze(3)).mT
 
     def normal_equations(
         self, point: Iterate, steps: LinearStep, motion: SimulatedMotion, data: WindowBatch, smooth: FloatArray
@@ -248,8 +248,8 @@ class LawWindows:
         along = self.along(motion.states, data, smooth, point, steps)
         tangent = self.tangent(along, point, steps)
         transfer = self.model.transfer(steps.values, data)
-        carried = transfer.drive * self.model.drive_noise[:, None]
-        whiten = self.model.whitening(carried)
+        carried = self.model.noise.carried(transfer.drive)
+        whiten = self.model.noise.whitening(carried)
         shown = self.output_sensitivities(point, steps, motion, data, smooth, along, tangent)
         white = as_rows(whiten @ self._spectra(shown))
         sound = white.isfinite().all(dim=2).all(dim=1)  # a diverged motion carries no information
@@ -389,7 +389,7 @@ class LawWindows:
 
     def _spectra(self, shown: Tensor) -> Tensor:
         """Spectra within the band of signals (B, T, R, X), (B, F, R, X)."""
-        found: Tensor = torch.fft.rfft(shown, dim=1)[:, 1 : self.model.bins + 1]
+        found: Tensor = torch.fft.rfft(shown, dim=1)[:, 1 : self.model.band.bins + 1]
         return found
 
     def _element_loads(
@@ -457,8 +457,8 @@ class LawWindows:
         model, s = self.model, self.model.simulator
         left = residual - columns.free.mT @ (columns.free_scale * dx0).unsqueeze(2)  # (B, K, 1)
         left = left - columns.sensitivities.mT @ step.unsqueeze(2)
-        noise = model.noise_told(columns.whiten, columns.carried, as_spectra(left, columns.whiten))
+        noise = model.noise.estimated(columns.whiten, columns.carried, as_spectra(left, columns.whiten))
         motion, support = model.moved_by(steps.values, columns.compliance, noise)
         moved = motion @ s.H.T.to(motion.dtype) + support  # (B, F, E)
-        found = torch.stack([model.signals(moved), model.signals(model.frequency.jw[:, None] * moved)])
+        found = torch.stack([model.band.signals(moved), model.band.signals(model.frequency.jw[:, None] * moved)])
         return np.asarray(found.numpy())

@@ -35,9 +35,9 @@ def nominal_cost(of_any: RefinerOfAnyInputs, windows: FloatArray) -> FloatArray:
             - s.states(every, data.w, rest) @ discrete.C.mT
             - data.w @ discrete.D.mT
         )
-        r = as_rows(at.whiten @ model.spectra(residual).unsqueeze(3))[:, 0]  # (B, K)
+        r = as_rows(at.whiten @ model.band.spectra(residual).unsqueeze(3))[:, 0]  # (B, K)
         along = r @ at.free[0].mT  # (B, N)
         left = r.square().sum(dim=1) - (along * torch.cholesky_solve(along.mT, at.factor[0]).mT).sum(dim=1)
         dropped = refiner.calibration.dropped(present)
-        over = model.spectra(data.measured @ dropped.mT) * model.weight[:, None]
+        over = model.band.spectra(data.measured @ dropped.mT) * model.noise.weight[:, None]
         return np.asarray((left + over.abs().square().sum(dim=(1, 2))).numpy())

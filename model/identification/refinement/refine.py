@@ -127,7 +127,7 @@ class Refiner:
     def observations(self) -> int:
         """Real numbers that a window with every sensor is compared in."""
         everything = np.ones(len(self.system.sensors), dtype=bool)
-        return 2 * self.model.bins * len(self.model.compression.matrix(everything))
+        return 2 * self.model.band.bins * len(self.model.compression.matrix(everything))
 
     def refine(
         self,
@@ -207,7 +207,7 @@ class Refiner:
         settled = (second.step.abs() / std).amax(dim=1) < _CONVERGED
         held = after <= here * (1 + 1e-6) + _SLACK + torch.where(settled, _PER_UNKNOWN * x.shape[1], 0.0)
         further = _limited(second.step)
-        if self.model.lost:  # the products of before leave out what lost inputs did there, not what they do here
+        if self.model.noise.lost:  # the products of before leave out what lost inputs did there, not what they do here
             near = (at.step.abs() / std).amax(dim=1) < _CONVERGED
             settled, further = settled & near, torch.where(near[:, None], further, 0.0)
             held = held | ~near
@@ -233,11 +233,11 @@ class Refiner:
         which = which[torch.linalg.cholesky_ex(at.covariance[which])[1] == 0]
         if len(which):
             at, second, data = at.take(which), second.take(which), data.take(which)
-            carried = at.transfer.drive * self.model.drive_noise[:, None]
+            carried = self.model.noise.carried(at.transfer.drive)
             given = carried, at.transfer.compliance, self.model.simulator.element_values(at.x)
             second = replace(second, step=second.released)  # of what the window says
             clean, outputs = self.calibration.smoothed(at, second, data, *given)
-            shown = self.model.by_drive(at, self.calibration.motions(clean), data)
+            shown = self.model.sensitivities.by_drive(at, self.calibration.motions(clean), data)
             found = self.calibration.evidence(at, replace(second, outputs=outputs), data, shown)
             at_rows = rows[which]
             progress.cross[at_rows], progress.information[at_rows] = found.cross, found.information
@@ -258,7 +258,7 @@ class Refiner:
         identifiable, noise = self._identifiable(data, x, torch.diagonal(covariance, dim1=1, dim2=2).sqrt())
         told, stretch = self._told(x, progress.released[rows])
         signals = len(self.model.compression.matrix(data.present))
-        freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
+        freedom = 2 * self.model.band.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
         # What the model cannot follow is treated as more noise: intervals keep their coverage.
         covariance = covariance * chi_square.clamp_min(1)[:, None, None] * stretch[:, :, None] * stretch[:, None, :]
@@ -268,9 +268,9 @@ class Refiner:
         rms[:, data.present] = data.measured.square().mean(dim=1).sqrt()
         path, shown = x0.new_zeros(len(x), 0, x0.shape[1]), x0.new_zeros(len(x), 0, len(data.present))
         error = progress.error[rows]
-        if states or self.model.lost:
+        if states or self.model.noise.lost:
             path, shown = self.model.simulated(x, x0, data)
-        if self.model.lost:  # the mean of a lost input is not told, and shifts all sensors
+        if self.model.noise.lost:  # the mean of a lost input is not told, and shifts all sensors
             left = data.measured - shown[:, :, data.present]
             shown[:, :, data.present] += left.mean(dim=1, keepdim=True)
             error[:, data.present] = left.std(dim=1, correction=0)
