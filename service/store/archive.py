@@ -1,6 +1,6 @@
 """Old windows as Parquet, by fleet and date: written before they are forgotten, read back by the history.
 
-    FOLDER/fleet=north/date=2026-09-21/part-1790000000000000000.parquet
+    FOLDER/fleet=north/date=2026-09-21/part-1790000000000000000-5f0c1d2e3a4b.parquet
 
 One row a window, with the names that the table `windows` has; arrays are lists of float64, and `model` is the digest.
 A vehicle's fleet is what stands before the last of `- _ . :` in its id ("north-0017" is of "north").  Files are only
@@ -11,6 +11,7 @@ are read once per start.  FOLDER may be an address that pyarrow knows, such as s
 from __future__ import annotations
 
 import re
+import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from urllib.parse import quote
 
 from sqlalchemy import ColumnElement, Connection, select
 
+from sprung.service.durable import sync_file, sync_folder
 from sprung.service.errors import UserError
 from sprung.service.store.schema import models, windows
 from sprung.service.store.windows import pack, unpack
@@ -58,6 +60,7 @@ class Archive:
                 self._files, self._root = fs.FileSystem.from_uri(place)
             else:
                 self._files, self._root = fs.LocalFileSystem(), str(Path(place).absolute())
+            self._local = isinstance(self._files, fs.LocalFileSystem)
             self._files.create_dir(self._root, recursive=True)
         except (OSError, ValueError) as error:
             raise UserError(f"archive {place}: {str(error).splitlines()[0]}") from error
@@ -109,10 +112,19 @@ class Archive:
                 changed += 1
                 if len(rest):
                     parquet.write_table(rest, f"{path}.part", filesystem=self._files, compression="zstd")
-                    self._files.move(f"{path}.part", path)
+                    self.put_in_place(path)
                 else:
                     self._files.delete_file(path)
         return changed
+
+    def put_in_place(self, path: str) -> None:
+        """Give a file that was written as `.part` its name; on a disk of this machine, it survives a power cut."""
+        if self._local:
+            sync_file(Path(f"{path}.part"))
+        self._files.move(f"{path}.part", path)
+        if self._local:
+            for folder in list(Path(path).parents)[: len(Path(path).relative_to(self._root).parts) + 1]:
+                sync_folder(folder)
 
     def _days(self, fleet: str, since: int, until: int) -> Iterator[list[str]]:
         """The files of each day that the range touches, newest day first."""
@@ -136,6 +148,7 @@ class _Parts:
     def __init__(self, archive: Archive, now: int, stack: ExitStack) -> None:
         self._archive, self._now, self._stack = archive, now, stack
         self._writers: dict[str, Any] = {}
+        self._paths: dict[str, str] = {}
 
     def add(self, rows: Sequence[Any]) -> None:
         """Write rows, in order of time, each into the file of its fleet and day."""
@@ -148,15 +161,17 @@ class _Parts:
             self._writer(place).write_table(pyarrow.Table.from_pylist(found, schema=_schema()))
 
     def publish(self) -> None:
-        """Give the files their names."""
+        """Give the files their names, on the disk for good."""
         for path in self._writers:
-            self._archive._files.move(f"{path}.part", path)
+            self._archive.put_in_place(path)
 
     def _writer(self, place: str) -> Any:
         from pyarrow import parquet
 
         folder = f"{self._archive._root}/{place}"
-        path = f"{folder}/part-{self._now}.parquet"
+        if place not in self._paths:  # of its own: a round has several turns, in which windows of one day go
+            self._paths[place] = f"{folder}/part-{self._now}-{secrets.token_hex(6)}.parquet"
+        path = self._paths[place]
         if path not in self._writers:
             self._archive._files.create_dir(folder, recursive=True)
             writer = parquet.ParquetWriter(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -71,11 +72,46 @@ def test_files_lie_by_fleet_and_date_and_anybody_can_read_them(store: Store, tmp
     with store.read() as connection:
         Archive(str(tmp_path / "archive")).keep(connection, 7)
     found = sorted(path.relative_to(tmp_path / "archive").as_posix() for path in tmp_path.rglob("*.parquet"))
-    assert found == [f"fleet=none/date=2026-09-{day}/part-7.parquet" for day in (21, 22)]
+    assert [re.sub("-[0-9a-f]{12}[.]", "-X.", name) for name in found] == [
+        f"fleet=none/date=2026-09-{day}/part-7-X.parquet" for day in (21, 22)
+    ]
     rows = dataset.dataset(tmp_path / "archive", partitioning="hive").to_table().to_pylist()
     assert [row["posterior"] for row in rows] == [[0.0] * 3, [0.001 * (DAY // HOP)] * 3]
     assert {row["model"] for row in rows} == {"digest"}
     assert rows[0]["identifiable"] == [True, False, True]
+
+
+def test_what_makes_room_in_many_turns_is_archived_whole(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each turn has windows of the same day; the files of one turn must not take the place of another's."""
+    monkeypatch.setattr(retention, "AT_ONCE", 7)
+    archive = Archive(str(tmp_path / "archive"))
+    model = fill(store, [record(i) for i in range(100)])
+    with store.write() as connection:
+        limits = retention.RetentionLimits(START + 10 * HOP, 0, 0, store_bytes=1000)
+        found = retention.forget(connection, limits, lambda c, *which: archive.keep(c, LONG_AFTER, *which))
+    assert found.windows == 100 and found.windows_for_room == 90
+    assert raw(store, archive, model) == [START + i * HOP for i in range(100)]
+
+
+def test_an_archive_is_on_the_disk_before_the_windows_go(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power cut would take both otherwise: the store is synced with its commit."""
+    synced: list[str] = []
+
+    def sync(path: Path) -> None:
+        assert path.exists()
+        synced.append(path.name)
+
+    monkeypatch.setattr("sprung.service.store.archive.sync_file", sync)
+    monkeypatch.setattr("sprung.service.store.archive.sync_folder", sync)
+    fill(store, [record(0)])
+    with store.read() as connection:
+        Archive(str(tmp_path / "archive")).keep(connection, 7)
+    assert synced[0].startswith("part-7-") and synced[0].endswith(".parquet.part")
+    assert synced[1:] == ["date=2026-09-21", "fleet=none", "archive", tmp_path.name]
 
 
 def test_a_vehicle_that_is_deleted_is_deleted_in_the_archive_too(store: Store, tmp_path: Path) -> None:
