@@ -126,9 +126,7 @@ class NonlinearRun:
     rate: FloatArray  # m/s, (T, E)
     force: FloatArray  # of the law at every site, N, (T, L)
     model: DiscreteSystem
-    knots: FloatArray  # (T, 2K)
     solution: Solution  # the laws' part alone
-    start: float  # the laws' clock at the first sample, s
 
 
 class NonlinearSimulator:
@@ -147,13 +145,12 @@ class NonlinearSimulator:
         mass: FloatArray | None = None,
         x0: FloatArray | None = None,
         start: float = CLOCK_LEAD,
-        near: NonlinearRun | None = None,
     ) -> NonlinearRun:
         """Simulate a recording.
 
         knots (T, 2K): value and slope of every drive at the samples, in the order of u.  stiffness, damping (E,) and
         mass (n,) replace the nominal values; x0 (N,) is the state at the first sample, at rest if left out.
-        `start` is the laws' clock there.  `near` is a run with similar parameters: fewer sweeps.
+        `start` is the laws' clock there.
         """
         mechanics = replace(
             self.mechanics,
@@ -170,16 +167,11 @@ class NonlinearSimulator:
         if self.parts is None and (needed := _parts_for_laws(model, known[..., 0], start)) > parts:
             model = DiscreteSystem(mechanics, self.sample_rate, model.placements, needed)
             known = model.known_motion(linear, chain)
-        guess = near.solution if near is not None and near.model.names == model.names else None
-        solution = solve(
-            model.steps, model.exact.transition, model.sites(), known, parts=model.parts, start=start, guess=guess
-        )
-        return _assemble(model, knots, linear[..., 0], solution, start)
+        solution = solve(model.steps, model.exact.transition, model.sites(), known, parts=model.parts, start=start)
+        return _assemble(model, knots, linear[..., 0], solution)
 
 
-def _assemble(
-    model: DiscreteSystem, knots: FloatArray, linear: FloatArray, solution: Solution, start: float
-) -> NonlinearRun:
+def _assemble(model: DiscreteSystem, knots: FloatArray, linear: FloatArray, solution: Solution) -> NonlinearRun:
     m = model.mechanics
     states = linear + solution.states[..., 0]
     u, fine = drive_vector(m, knots), solution.force[..., 0]
@@ -191,9 +183,7 @@ def _assemble(
         rate=states[:, m.n :] @ m.H.T + u[:, m.support_drive + 1] @ m.G.T,
         force=fine[:: model.parts],
         model=model,
-        knots=knots,
         solution=solution,
-        start=start,
     )
 
 

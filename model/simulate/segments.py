@@ -30,8 +30,6 @@ class Solution:
     states: FloatArray  # at the samples, (T, N, V)
     motion: FloatArray  # deflections and rates of the sites at every step, inputs included, ((T-1) parts + 1, 2L, V)
     force: FloatArray  # there, ((T-1) parts + 1, L, V)
-    memories: tuple[FloatArray, ...]  # per site, there, ((T-1) parts + 1, memory, V)
-    sweeps: int
 
 
 def solve(
@@ -42,7 +40,6 @@ def solve(
     *,
     parts: int,
     start: float,
-    guess: Solution | None = None,
     tolerance: float = 1e-6,
 ) -> Solution:
     """Law forces of V runs along known ((T-1) 2 parts + 1, 2L, V), from rest of the laws' part.
@@ -53,10 +50,10 @@ def solve(
     V, samples = known.shape[2], (len(known) - 1) // (2 * parts)
     if not sites:
         none = np.zeros((samples * parts + 1, 0, V))
-        return Solution(np.zeros((samples + 1, len(transition), V)), none, none, (), 0)
+        return Solution(np.zeros((samples + 1, len(transition), V)), none, none)
     segments = int(np.clip(_WIDTH // V, 1, max(1, samples // _SHORTEST)))
     while True:
-        found = _sweeps(steps, transition, sites, known, parts, start, guess, tolerance, segments)
+        found = _sweeps(steps, transition, sites, known, parts, start, tolerance, segments)
         if found is not None:
             return found
         # hardly damped systems forget too slowly for many segments
@@ -70,7 +67,6 @@ def _sweeps(
     known: FloatArray,
     parts: int,
     start: float,
-    guess: Solution | None,
     tolerance: float,
     segments: int,
 ) -> Solution | None:
@@ -81,7 +77,7 @@ def _sweeps(
     stacked = _stack(known, segments, 2 * parts * Q)
     wide = [_widen(site, segments) for site in sites]
     clocks = np.repeat(start + np.arange(segments) * Q * parts * steps.h, V)
-    x, z = _first_guess(wide, stacked[0], clocks, guess, (segments, Q, V, len(transition)))
+    x, z = _at_rest(wide, stacked[0], clocks, (segments, V, len(transition)))
     over = np.linalg.matrix_power(transition, Q)
     largest: FloatArray | None = None
     changes: list[float] = []
@@ -89,7 +85,7 @@ def _sweeps(
         with np.errstate(over="ignore", invalid="ignore"):  # a run away is met below
             done = march(steps, wide, stacked, parts=parts, x0=_flat(x), z0=[_flat(value) for value in z], start=clocks)
         if segments == 1:
-            return _join(done, (segments, Q, V, samples), parts, sweep)
+            return _join(done, (segments, Q, V, samples), parts)
         size = np.abs(done.states).max(axis=(0, 2))[:, None, None]
         largest = size if largest is None else largest
         if not np.all(size < _RUNAWAY * np.maximum(largest, 1e-300)):
@@ -103,7 +99,7 @@ def _sweeps(
             return None
         changes.append(change)
         x = x + moved
-    return _join(done, (segments, Q, V, samples), parts, sweep)
+    return _join(done, (segments, Q, V, samples), parts)
 
 
 def _corrections(ends: FloatArray, x: FloatArray, over: FloatArray) -> FloatArray:
@@ -145,26 +141,20 @@ def _widen(site: Site, segments: int) -> Site:
     return Site(site.law, tuple(tile(value) for value in site.p), element)
 
 
-def _first_guess(
-    sites: Sequence[Site], y: FloatArray, clocks: FloatArray, guess: Solution | None, shape: tuple[int, ...]
+def _at_rest(
+    sites: Sequence[Site], y: FloatArray, clocks: FloatArray, shape: tuple[int, ...]
 ) -> tuple[FloatArray, list[FloatArray]]:
-    """First states (N, segments, V) and memories of every segment."""
-    segments, Q, V, N = shape
+    """First states (N, segments, V) and memories of every segment, as if the laws began there."""
+    segments, V, N = shape
     L = len(sites)
-    x = np.zeros((N, segments, V))
     z = []
     for i, site in enumerate(sites):
         begin = site.law.memory_start(Motion(y[i], y[L + i], clocks), site.p, site.element)
         z.append(np.broadcast_to(begin, (site.law.memory, segments * V)).reshape(site.law.memory, segments, V).copy())
-    if guess is not None:
-        at = np.arange(1, segments) * Q
-        x[:, 1:] = guess.states[at].transpose(1, 0, 2)
-        for i, path in enumerate(guess.memories):
-            z[i][:, 1:] = path[at * ((len(path) - 1) // (len(guess.states) - 1))].transpose(1, 0, 2)
-    return x, z
+    return np.zeros((N, segments, V)), z
 
 
-def _join(done: March, shape: tuple[int, ...], parts: int, sweeps: int) -> Solution:
+def _join(done: March, shape: tuple[int, ...], parts: int) -> Solution:
     """The segments one after the other, cut to the recording's length."""
     segments, Q, V, samples = shape
 
@@ -178,6 +168,4 @@ def _join(done: March, shape: tuple[int, ...], parts: int, sweeps: int) -> Solut
         states=chain(done.states, Q, samples + 1),
         motion=chain(done.motion, Q * parts, fine),
         force=chain(done.forces, Q * parts, fine),
-        memories=tuple(chain(path, Q * parts, fine) for path in done.memories),
-        sweeps=sweeps,
     )

@@ -115,12 +115,12 @@ class LawSearch:
         self.cross = torch.zeros(B, self.reported, H, dtype=torch.float64)
         self.information, self.score = torch.zeros(B, H, H, dtype=torch.float64), torch.zeros(B, H, dtype=torch.float64)
 
-    def run(self, states: bool, near: bool = False, iterations: int = ITERATIONS) -> Refined:
-        """Iterate until every window has converged, or `iterations` times; near: the start is known to be good."""
+    def run(self, states: bool, warm: bool = False, iterations: int = ITERATIONS) -> Refined:
+        """Iterate until every window has converged, or `iterations` times; warm: the start is known to be good."""
         active = torch.arange(len(self.cost))
         if not self.work.ended:
             active = self._start(active, last=iterations == 1)
-        if not near and len(active) and iterations > 1 and not self.work.ended:  # again, from the median of that
+        if not warm and len(active) and iterations > 1 and not self.work.ended:  # again, from the median of that
             self.point.unknowns[active] = self.point.unknowns.median(dim=0).values
             active = self._start(active, last=False)
         for left in reversed(range(iterations - 1)):

@@ -108,18 +108,18 @@ class LawRefiner:
         present: BoolArray = ~np.asarray(np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1))
         model = self._with(loads)
 
-        def search(at: IntArray, near: bool) -> Refined:
+        def search(at: IntArray, warm: bool) -> Refined:
             # forces that leave all bounds are reported as such
             with torch.no_grad(), np.errstate(over="ignore", invalid="ignore"):
                 data = self.model.batch(self.model.knots(windows[at]), windows[at], present[at[0]])
                 asked = torch.as_tensor(wanted[at]), bool(wanted.any())
                 search = LawSearch(model, self.calibration, data, begin[at], *asked, self.work)
-                found = search.run(states, near, iterations)
+                found = search.run(states, warm, iterations)
                 return replace(found, excitation=self.model.excitation(windows[at]))
 
-        def refined(of: IntArray, near: bool) -> Refined:
+        def refined(of: IntArray, warm: bool) -> Refined:
             pieces = self._pieces(present, of)
-            return in_order(share(partial(search, near=near), pieces, self.workers), np.concatenate(pieces))
+            return in_order(share(partial(search, warm=warm), pieces, self.workers), np.concatenate(pieces))
 
         if start is not None or len(windows) < _MANY:
             found = refined(np.arange(len(windows)), start is not None)
@@ -144,14 +144,14 @@ class LawRefiner:
 def _from_pilots(begin: FloatArray, refined: Callable[[IntArray, bool], Refined], P: int) -> Refined:
     """All windows, of which a few pilots determine where the others start, in rows of `begin` (B, P).
 
-    refined: the refinement of some windows, and whether they start near.
+    refined: the refinement of some windows, and whether their start is a warm one, near the maximum.
     """
     everything = np.arange(len(begin))
     pilots = np.linspace(0, len(begin) - 1, _PILOT_WINDOWS).astype(int)
     others = np.setdiff1d(everything, pilots)
     first = refined(pilots, False)
-    near = _start_from_well_fitted(begin, others, first, P)
-    return in_order([first, refined(others, near)], np.concatenate([pilots, others]))
+    warm = _start_from_well_fitted(begin, others, first, P)
+    return in_order([first, refined(others, warm)], np.concatenate([pilots, others]))
 
 
 def _badly_fitted_again(
