@@ -182,41 +182,39 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
     state = _state(problem, *_begun(problem, start, whitener))
     if not problem.system.file.inputs:
         state = _begun_anew(problem, state)
-    rules, damping, left, count = problem.rules.fit, _DAMPING[0], np.inf, 0
-    relaxation, renewed = _Relaxation(), False  # whether the present point's inputs were smoothed anew
-    for count in range(1, max(1, round(rules.patience * iterations)) + 1):
-        step, sigma, promised = _step(problem, state.lin, state.point, damping)
-        if not problem.process_noise:  # whose sensitivities know what the smoother makes of the laws' forces
-            relaxation = relaxation.after(state.lin.jacobian @ step)
-        step = relaxation.factor * step
-        size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
-        grain = _grain(problem, state)
-        proposed = _proposed(problem, state, step, promised)
-        if proposed.value >= state.value and promised < rules.numerical * grain:
-            left = promised
+    search, count = _Search(state), 0
+    for count in range(1, max(1, round(problem.rules.fit.patience * iterations)) + 1):
+        search = _stepped(problem, search, count, tolerance)
+        if search.ended:
             break
-        rise = proposed.value - state.value
-        if 0 <= rise < rules.smoothing * state.chi_square and not (renewed or problem.process_noise):
-            state, renewed = _state(problem, state.point, proposed.working, fine=state.lin.fine), True
-            if proposed.value >= state.value:
-                left, relaxation = promised, _Relaxation()
-                continue
-        if proposed.value < state.value:
-            left = state.value - proposed.value
-            state, renewed = proposed, False
-            damping = max(damping / 10, _DAMPING[0] / 1e3)
-            if size < tolerance or left < rules.done * grain * max(1.0, size):
-                break
-            if count in (2, 4):
-                state = replace(state, point=with_equivalents(problem, state.point, state.working.inputs))
-        elif promised > _MUCH * state.chi_square and state.lin.may_be_finer:
-            left, state = promised, replace(state, lin=replace(state.lin, fine=True))
-        else:
-            left, relaxation = promised, _Relaxation()
-            damping = max(damping * 30, 100 * _DAMPING[0])
-            if damping > _DAMPING[1]:
-                break
-    return _finish(problem, state, left, count)
+    return _finish(problem, search.state, search.left, count)
+
+
+def _stepped(problem: Problem, search: _Search, count: int, tolerance: float) -> _Search:
+    """The search after its `count`-th step, which is accepted, refused, or taken again from the present point."""
+    rules, state = problem.rules.fit, search.state
+    step, sigma, promised = _step(problem, state.lin, state.point, search.damping)
+    if not problem.process_noise:  # whose sensitivities know what the smoother makes of the laws' forces
+        search = replace(search, relaxation=search.relaxation.after(state.lin.jacobian @ step))
+    step = search.relaxation.factor * step
+    size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
+    grain = _grain(problem, state)
+    proposed = _proposed(problem, state, step, promised)
+    if proposed.value >= state.value and promised < rules.numerical * grain:
+        return replace(search, left=promised, ended=True)
+    rise = proposed.value - state.value
+    if 0 <= rise < rules.smoothing * state.chi_square and not (search.renewed or problem.process_noise):
+        search = search.renewed_by(_state(problem, state.point, proposed.working, fine=state.lin.fine))
+        if proposed.value >= search.state.value:
+            return replace(search, left=promised, relaxation=_Relaxation())
+    if proposed.value < search.state.value:
+        search = search.accepted(proposed)
+        if size < tolerance or search.left < rules.done * grain * max(1.0, size):
+            return replace(search, ended=True)
+        return search.with_equivalents(problem) if count in (2, 4) else search
+    if promised > _MUCH * search.state.chi_square and search.state.lin.may_be_finer:
+        return search.finer(promised)
+    return search.refused(promised)
 
 
 def _proposed(problem: Problem, state: _State, step: FloatArray, promised: float) -> _State:
@@ -252,6 +250,42 @@ class _Relaxation:
         if abs(along) < _PARALLEL * np.sqrt(size * float(change @ change)) or ratio >= 1:
             return _Relaxation(1.0, change)
         return _Relaxation(float(np.clip(self.factor / (1 - ratio), *_RELAXED)), change)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Where the optimiser is, and how its last step went."""
+
+    state: _State
+    damping: float = _DAMPING[0]
+    left: float = np.inf  # by which the objective fell last, or what a step that was not taken promised
+    relaxation: _Relaxation = _Relaxation()
+    renewed: bool = False  # whether the present point's inputs were smoothed anew
+    ended: bool = False
+
+    def renewed_by(self, state: _State) -> _Search:
+        """At the same point, under inputs smoothed anew."""
+        return replace(self, state=state, renewed=True)
+
+    def accepted(self, proposed: _State) -> _Search:
+        """A step further, with less damping."""
+        left, damping = self.state.value - proposed.value, max(self.damping / 10, _DAMPING[0] / 1e3)
+        return replace(self, state=proposed, renewed=False, left=left, damping=damping)
+
+    def with_equivalents(self, problem: Problem) -> _Search:
+        """With the laws' linear equivalents at the present values."""
+        point = with_equivalents(problem, self.state.point, self.state.working.inputs)
+        return replace(self, state=replace(self.state, point=point))
+
+    def finer(self, promised: float) -> _Search:
+        """With finer sensitivities: those of before promise what does not come."""
+        return replace(self, left=promised, state=replace(self.state, lin=replace(self.state.lin, fine=True)))
+
+    def refused(self, promised: float) -> _Search:
+        """At the same point with more damping; ended where there is no more."""
+        damping = max(self.damping * 30, 100 * _DAMPING[0])
+        ended = damping > _DAMPING[1]
+        return replace(self, left=promised, relaxation=_Relaxation(), damping=damping, ended=ended)
 
 
 def _grain(problem: Problem, state: _State) -> float:
