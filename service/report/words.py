@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from sprung.model.diagnosis.report.report import Finding, LawParameter, Report
+from sprung.model.diagnosis.report.sentences import names_in_words
 from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.basis import UNKNOWN
 from sprung.service.report.ink import engineering
@@ -26,7 +27,7 @@ def effect_words(effect: str, laws: Laws = CATALOGUE) -> str:
     if effect == UNKNOWN:
         return "an unknown law"
     law = _called(effect, laws)
-    return effect.replace("_", " ") if law is None else law.title
+    return names_in_words(effect) if law is None else law.title
 
 
 def _called(effect: str, laws: Laws) -> Law | None:

@@ -15,7 +15,8 @@ from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of
 from sprung.model.diagnosis.report.values import formula_of, input_fault_parameter, law_parameters, quoted_values
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.rules import ReportRules
+from sprung.model.diagnosis.rules import ReportRules, Rules
+from sprung.model.diagnosis.selection.compete import unnamed_alike
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.system import System
@@ -72,7 +73,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
             continue
         parameters = _free(term, law_parameters(outcome.final, state.given + index, state.options.rules.plausible))
         rival = found.runner_up
-        family, advice = _look_alikes(found, state.options.rules.report)
+        family, advice = _look_alikes(found, state.options.rules)
         finding = Finding(
             location=term.location,
             effect=term.law.name,
@@ -101,17 +102,19 @@ def _free(term: Term, parameters: tuple[LawParameter, ...]) -> tuple[LawParamete
     return tuple(one for one, fixed in zip(parameters, term.fixed, strict=True) if not fixed)
 
 
-def _look_alikes(found: AcceptedFinding, rules: ReportRules) -> tuple[str | None, str | None]:
+def _look_alikes(found: AcceptedFinding, rules: Rules) -> tuple[str | None, str | None]:
     """Look-alikes of a law at its place, in words, and the experiment that would distinguish them.
 
-    A law of more evidence with implausible values is included.
+    A law of more evidence with implausible values is included, and a force without a name that is as plain.
     """
     best = found.trial
-    close = [t for t in found.trials if t.evidence > best.evidence - rules.naming_margin]
+    close = [t for t in found.trials if t.evidence > best.evidence - rules.report.naming_margin]
     close += found.implausible
     near = [
         t for t in close if t.named and t.term.location == best.term.location and t.term.law.name != best.term.law.name
     ]
+    if best.term.law.listed:
+        near += unnamed_alike(found.trials, best, rules.report.naming_margin, rules.evidence)
     if not near:
         return None, None
     names = " or ".join([best.term.law.name, *dict.fromkeys(t.term.law.name for t in near)])

@@ -8,6 +8,7 @@ from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import Finding
 from sprung.model.diagnosis.report.values import deviations
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws.basis import UNKNOWN
 
 
 def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
@@ -19,7 +20,7 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
         words = term.law.title
     words += term.law.axis_in_words(term.variant)
     if finding.family is not None:
-        words = f"{finding.family.replace('_', ' ')}, which this recording cannot distinguish; as the first, {words}"
+        words = f"{names_in_words(finding.family)}, which this recording cannot distinguish; as the first, {words}"
     if finding.elsewhere:
         others = " or ".join(place.replace("|", " and ") for place in finding.elsewhere)
         words += f" (or as much at {others}, which this recording cannot distinguish)"
@@ -29,6 +30,11 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
     if bias is not None and found[0].trial.term.key[:2] == term.key[:2]:  # the common bias is stated once
         sentence += f"; {bias}"
     return sentence
+
+
+def names_in_words(family: str) -> str:
+    """Names of look-alikes, such as "bump_stop or unknown", as words."""
+    return family.replace(f" or {UNKNOWN}", " or a force without a name").replace("_", " ")
 
 
 def _formula_in_words(finding: Finding) -> str:

@@ -341,6 +341,26 @@ def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> l
     return trials
 
 
+def unnamed_alike(trials: Sequence[Trial], law: Trial, margin: float, rules: EvidenceRules) -> list[Trial]:
+    """Unnamed forces at a law's place, no more flexible than it, whose fits do not speak less for them by the margin.
+
+    That such a force is rare before a recording is no reason to call the law determined by the recording.
+    """
+
+    def of_recording(trial: Trial) -> float:
+        return trial.evidence + rules.rarity * trial.term.law.prior_cost
+
+    return [
+        t
+        for t in trials
+        if not t.named
+        and t.finished
+        and t.term.location == law.term.location
+        and t.freedom <= law.freedom
+        and of_recording(t) > of_recording(law) - margin
+    ]
+
+
 def cost(fit: Fit, rules: EvidenceRules = RULES.evidence, index: int = -1) -> float:
     """Cost in evidence of a law's parameters and of its rarity; index: of the term, by default the last."""
     term, place = fit.point.terms[index], fit.place(index)

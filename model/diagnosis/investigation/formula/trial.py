@@ -19,7 +19,7 @@ def with_formula(state: Investigation, plain: list[Trial], trials: list[Trial]) 
 
     A named law that was preferred to an unnamed force, or that leaves much of the misfit, is replaced only by a formula
     that explains more than it; one that leaves little, but explains less than the unnamed force, by a formula that is
-    far more likely.
+    far more likely.  Where no single formula is, and the unnamed force is as plain as the law, the law is not named.
     """
     leader = _force_to_express(state, plain)
     if leader is None or state.problem.process_noise or not state.options.unnamed:
@@ -27,8 +27,9 @@ def with_formula(state: Investigation, plain: list[Trial], trials: list[Trial]) 
     formula, reason = _formula(state, leader)
     if formula is not None and _replaces(state, trials[0], formula):
         return [formula, *(trial for trial in trials if trial is not leader or trial.named)], ()
-    if formula is not None or trials[0].named:
+    if formula is not None or not (leader is trials[0] or _is_likelier(state, leader, trials[0])):
         return trials, ()
+    trials = [leader, *(trial for trial in trials if trial is not leader)]
     place = leader.term.location
     return trials, (f"{place}: surface only; {reason}",)
 
@@ -52,6 +53,16 @@ def _replaces(state: Investigation, leader: Trial, formula: Trial) -> bool:
     settled = excess_chi_square(state.problem, leader.fit) == 0
     single = formula.term.element_law.strength is not None  # the second of two shapes may belong to another law
     return settled and single and formula.evidence > leader.evidence + rules.likelier
+
+
+def _is_likelier(state: Investigation, force: Trial, law: Trial) -> bool:
+    """Whether an unnamed force is likelier than a law that leaves only noise, and no more flexible.
+
+    Flexible forces may take on what the simulation of a law has wrong; one as plain as the law is another law's.
+    """
+    settled = excess_chi_square(state.problem, law.fit) == 0
+    as_plain = not force.named and force.freedom <= law.freedom and force.term.location == law.term.location
+    return settled and as_plain and force.evidence > law.evidence
 
 
 def _force_to_express(state: Investigation, plain: list[Trial]) -> Trial | None:

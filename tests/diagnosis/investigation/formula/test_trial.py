@@ -75,6 +75,45 @@ def test_a_spring_that_softens_and_stiffens_again_is_a_formula_and_no_bump_stop(
     assert (finding.location, finding.effect) == ("secondary", "formula")
 
 
+def _trial(law: Any, gain: float, freedom: int, reduced: float = 0.9) -> Trial:
+    """A trial whose evidence is its gain."""
+    point = SimpleNamespace(terms=(Term(law, "secondary", tuple(1.0 for _ in law.parameters)),))
+    nothing: Any = None
+    fitted: Any = SimpleNamespace(point=point, reduced=reduced, count=10_000)
+    return Trial(nothing, fitted, gain, gain, gain, freedom)
+
+
+def _state() -> Any:
+    return SimpleNamespace(
+        options=Options(),
+        problem=SimpleNamespace(rules=RULES, process_noise=False, work=None),
+        fit=SimpleNamespace(reduced=2.0, count=10_000),
+        system=quarter_car(),
+        held=None,
+    )
+
+
+@pytest.mark.parametrize(
+    ("gain", "freedom", "reduced", "leads"),
+    [
+        (180.0, 1, 0.9, True),  # the stop is weak, and a smooth spring says as much and more with one value
+        (140.0, 1, 0.9, False),
+        (180.0, 18, 0.9, False),  # a map of the force imitates any law
+        (180.0, 1, 1.5, False),  # more than noise is left beside the stop: further laws may be there
+    ],
+)
+def test_a_law_is_not_named_where_a_force_as_plain_is_likelier_even_without_a_single_formula(
+    monkeypatch: pytest.MonkeyPatch, gain: float, freedom: int, reduced: float, leads: bool
+) -> None:
+    stop = element_law("bump_stop")
+    named, unnamed = _trial(stop, 160.0, 2, reduced), _trial(replace(stop, named=False), gain, freedom)
+    monkeypatch.setattr(formula_trial, "_formula", lambda state, leader: (None, "several formulas do as well"))
+    monkeypatch.setattr(formula_trial, "_force_to_express", lambda state, plain: unnamed)
+    trials, notes = formula_trial.with_formula(_state(), [named, unnamed], [named, unnamed])
+    assert trials[0] is (unnamed if leads else named)
+    assert bool(notes) == leads
+
+
 @pytest.mark.parametrize(
     ("gain", "left", "expected"),
     [(1000.0, 0.0, None), (1020.0, 0.0, None), (1100.0, 0.0, "force"), (1020.0, 0.08, "stop")],
@@ -83,26 +122,10 @@ def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_
     monkeypatch: pytest.MonkeyPatch, gain: float, left: float, expected: str | None
 ) -> None:
     monkeypatch.setattr(formula_trial, "missing", lambda problem, fit: left)
-    fit = SimpleNamespace(reduced=0.9, count=10_000)
-
-    def trial(law: Any, gain: float, freedom: int) -> Trial:
-        term = Term(law, "secondary", tuple(1.0 for _ in law.parameters))
-        point = SimpleNamespace(terms=(term,))
-        nothing: Any = None
-        fitted: Any = SimpleNamespace(point=point, **vars(fit))
-        return Trial(nothing, fitted, gain, gain, gain, freedom)
-
     stop = element_law("bump_stop")
-    force = replace(stop, named=False)
-    state: Any = SimpleNamespace(
-        options=Options(),
-        problem=SimpleNamespace(rules=RULES, process_noise=False),
-        fit=SimpleNamespace(reduced=2.0, count=10_000),
-        system=quarter_car(),
-    )
-    leader, unnamed = trial(stop, 1000.0, 2), trial(force, gain, 18)
+    leader, unnamed = _trial(stop, 1000.0, 2), _trial(replace(stop, named=False), gain, 18)
     led: dict[str | None, Trial | None] = {"force": unnamed, "stop": leader, None: None}
-    assert formula_trial._force_to_express(state, [leader, unnamed]) is led[expected]
+    assert formula_trial._force_to_express(_state(), [leader, unnamed]) is led[expected]
 
 
 @pytest.mark.slow
