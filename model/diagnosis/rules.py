@@ -440,6 +440,9 @@ class ComponentRules:
     lost: float = rule(0.05, "of the stiffness that a spring keeps within its gap; chosen", 0.02, 0.1)
     slips: float = rule(0.05, "of the time; chosen: what slips less has shown its gap only", 0.02, 0.1)
     lowest_knee: float = rule(0.3, "of the median rate; chosen: a valve that opens below acts as friction", 0.2, 0.5)
+    knees: float = rule(
+        0.5, "of the rate passed within a sample, that such a valve's is; derived: both knees lie within it", 0.3, 0.8
+    )
     valve_least: float = rule(-0.02, "of the damping, left beyond a knee; derived: none, and its error", -0.1, 0.0)
     valve_most: float = rule(0.98, "of the damping, left beyond a knee; chosen: more is no valve", 0.95, 0.99)
     no_longer: float = rule(10.0, "times, by which a damping was read too high without a law; chosen", 5.0, 20.0)

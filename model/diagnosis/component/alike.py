@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sprung.model.diagnosis.component.low_valve import low_valve
 from sprung.model.diagnosis.force.deviations import moved_in_common
 from sprung.model.diagnosis.force.fit import ComponentFit, refined
+from sprung.model.diagnosis.force.low_valve import low_valve
 from sprung.model.diagnosis.force.search import Step, plausible
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray

@@ -112,7 +112,7 @@ class Piece:
     acting_parameters: Parameters | None = None
     believed: Believed = lambda fitted: True  # whether values are plausible for the record
     imitates: bool = False  # so flexible that it must leave as little as several laws
-    at_low_rates: ElementLaw | None = None  # law that it is equivalent to at low rates
+    at_low_rates: Piece | None = None  # what acts like it where it changes at low rates (`low_valve`)
     yields_with_rate: bool = False  # a yield force above a rate, with a steep slope below it
     strengthened: bool = False  # whether its strength may follow a signal: by a valve, a temperature
 

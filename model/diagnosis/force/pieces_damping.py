@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from sprung.model.diagnosis.force.piece import (
@@ -17,6 +19,7 @@ from sprung.model.laws.damping import DAMPER_ASYMMETRY, DAMPER_BLOWOFF, POWER_LA
 from sprung.model.laws.hysteresis import AIR_SPRING, SERIES_STIFFNESS
 
 _EXPONENT = POWER_LAW_DAMPING.parameters[1]
+_LOW = 0.02  # of the lowest knee that is searched: no limit beside what the motion resolves
 
 
 def _knee_limits(seen: MotionSizes) -> tuple[float, float]:
@@ -72,6 +75,7 @@ _BLOWOFF = Piece(
     lambda a, s, e: {"force_at_knee": (float(e.damping) * s[0], "N")},
     believed=_opens_late_enough,
 )
+LOW_VALVE = replace(_BLOWOFF, limits=lambda seen: [(_LOW * seen.lowest_knee, float(seen.rate[97]))])
 _TWO_KNEES = Piece(
     wider_form(DAMPER_BLOWOFF),
     ("knee", "knee_compression"),

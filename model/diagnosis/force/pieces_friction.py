@@ -16,8 +16,9 @@ from sprung.model.diagnosis.force.piece import (
     Values,
     wider_form,
 )
+from sprung.model.diagnosis.force.pieces_damping import LOW_VALVE
 from sprung.model.laws import SpringDamper, grid
-from sprung.model.laws.damping import COULOMB_FRICTION, DAMPER_BLOWOFF
+from sprung.model.laws.damping import COULOMB_FRICTION
 from sprung.model.laws.friction import DAHL, LUGRE, STRIBECK
 from sprung.model.laws.hysteresis import BOUC_WEN
 from sprung.model.laws.lost_motion import FRICTION_BACKLASH, PINCHED_HYSTERESIS
@@ -73,7 +74,7 @@ _COULOMB = Piece(
     lambda p: (p[1],),
     lambda a, s, e: {"breakaway_force": (a[0], "N")},
     kind=FRICTION,
-    at_low_rates=DAMPER_BLOWOFF,
+    at_low_rates=LOW_VALVE,
     yields_with_rate=True,
     strengthened=True,
 )

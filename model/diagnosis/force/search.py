@@ -23,6 +23,7 @@ from sprung.model.diagnosis.force.fit import (
     fitted,
     refined,
 )
+from sprung.model.diagnosis.force.low_valve import low_valve
 from sprung.model.diagnosis.force.piece import LAGS, FittedPiece, Following, Lag, LawPiece, Part
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.pieces_following import pieces_following
@@ -398,25 +399,33 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
 
 
 def _formed(chosen: Ranked, rules: ComponentRules, given: int) -> Ranked:
-    """The same with laws that follow a signal in another form, if that gains the naming margin in evidence."""
+    """The same with laws in another form, if that gains the naming margin in evidence.
+
+    That is another dependence on a signal, or a valve that opens at low rates in the place of a friction.
+    """
     best = chosen
     for index in range(given, len(chosen.fit.model.pieces)):
-        model = best.fit.model
-        piece = model.pieces[index]
-        if not isinstance(piece, Following):
+        others = _other_forms(best.fit, index)
+        if not others:
             continue
-        strengths, shape = best.fit.strengths_of(index), model.shapes[index]
-        others = [
-            refined(chosen.fit.task, model.replaced(index, form, start))
-            for form in piece.forms
-            for start in form.starts(strengths, shape)
-        ]
-        rest = fitted(chosen.fit.task, model.without(index))
-        ranked = _rank([*(fit for fit in others if plausible(fit, index)), best.fit], rest, rules)
+        rest = fitted(chosen.fit.task, best.fit.model.without(index))
+        ranked = _rank([*others, best.fit], rest, rules)
         own = next(r for r in ranked if r.fit is best.fit)
         better = ranked[0].evidence > own.evidence + rules.naming_margin
         best = ranked[0] if better and ranked[0].fit.held_out < own.fit.held_out else best
     return best
+
+
+def _other_forms(fit: ComponentFit, index: int) -> list[ComponentFit]:
+    """Fits with another form of a law."""
+    model, piece = fit.model, fit.model.pieces[index]
+    if not isinstance(piece, Following):
+        valve = low_valve(fit, index)
+        return [] if valve is None else [valve]
+    strengths, shape = fit.strengths_of(index), model.shapes[index]
+    starts = ((form, start) for form in piece.forms for start in form.starts(strengths, shape))
+    others = [refined(fit.task, model.replaced(index, form, start)) for form, start in starts]
+    return [other for other in others if plausible(other, index)]
 
 
 def _renamed(steps: list[Step], current: Ranked, given: int, tests: int, rules: ComponentRules) -> list[Step]:

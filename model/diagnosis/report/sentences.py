@@ -34,7 +34,8 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
 
 def names_in_words(family: str) -> str:
     """Names of look-alikes, such as "bump_stop or unknown", as words."""
-    return family.replace(f" or {UNKNOWN}", " or a force without a name").replace("_", " ")
+    names = family.split(" or ")
+    return " or ".join("a force without a name" if name == UNKNOWN else name.replace("_", " ") for name in names)
 
 
 def _formula_in_words(finding: Finding) -> str:

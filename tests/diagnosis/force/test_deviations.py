@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.component.low_valve import low_valve
 from sprung.model.diagnosis.force.deviations import covariance, left_open, moved_in_common
 from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentFit, ComponentTask, refined
+from sprung.model.diagnosis.force.low_valve import low_valve
 from sprung.model.diagnosis.force.motion import element_motion
 from sprung.model.diagnosis.force.piece import Piece
 from sprung.model.diagnosis.force.pieces import PIECES
