@@ -444,7 +444,6 @@ class ComponentRules:
         0.5, "of the rate passed within a sample, that such a valve's is; derived: both knees lie within it", 0.3, 0.8
     )
     valve_least: float = rule(-0.02, "of the damping, left beyond a knee; derived: none, and its error", -0.1, 0.0)
-    valve_most: float = rule(0.98, "of the damping, left beyond a knee; chosen: more is no valve", 0.95, 0.99)
     no_longer: float = rule(10.0, "times, by which a damping was read too high without a law; chosen", 5.0, 20.0)
     frame: float = rule(0.01, "of the rod's motion; chosen: a body that moves less is ground", 0.005, 0.02)
     moves: float = rule(2.0, "noise deviations by which a rod has to move; chosen: 1 is noise alone", 1.5, 3.0)

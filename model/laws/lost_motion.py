@@ -144,6 +144,6 @@ PINCHED_HYSTERESIS = ElementLaw(
     memory=1,
     memory_rate=_pinched_rate,
     path=_pinched_path,
-    prior_cost=RARE,
+    prior_cost=2 * RARE,  # it imitates friction with backlash, too, which is rare itself
     screened=False,
 )

@@ -191,7 +191,7 @@ PROGRESSIVE_STOP = ElementLaw(
         "{gap_compression} of compression"
     ),
     strength=None,
-    prior_cost=RARE,
+    prior_cost=2 * RARE,  # it contains stops that differ in the two directions, and these such that do not
     screened=False,
 )
 

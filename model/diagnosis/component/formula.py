@@ -33,6 +33,11 @@ class FormulaPiece(Piece):
     parts: int = 0  # complexity
 
     @property
+    def plain(self) -> int:
+        """Formulas compete with each other alone, by their `parts`."""
+        return 0
+
+    @property
     def key(self) -> str:
         """Distinguishes formulas."""
         return f"{EFFECT} {self.law.formula} {self.law.memory_formula}"

@@ -80,7 +80,6 @@ def own_piece(law: ElementLaw, seen: Observed) -> Piece | None:
         parameters=parameters,
         shape_of=lambda values: tuple(float(values[i]) for i in others),
         kind=HYSTERESIS if law.memory else STATIC,
-        plain=int(law.prior_cost > 0),
         believed=believed,
     )
 

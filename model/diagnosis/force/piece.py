@@ -8,6 +8,7 @@ Strengths, k, c and preload follow by linear least squares for given shapes (var
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,6 +19,7 @@ from sprung.model.diagnosis.kinds import EffectKind, kind_of_law
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import CLOCK_LEAD, UNIT_ELEMENT, ElementLaw, SpringDamper, reversal_step
 from sprung.model.laws.along import force_along
+from sprung.model.laws.base import RARE
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.channel import SensorResponse
 from sprung.model.laws.following import Covariate
@@ -107,7 +109,7 @@ class Piece:
     shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # by the law's parameters
     quoted: Named = lambda a, s, e: {}
     kind: PieceKind = STATIC  # look-alikes are mostly of one kind
-    plain: int = 0  # prior cost: number of commoner laws it contains
+    rarer: int = 0  # than its law states, along a single motion: as `plain`
     acting: ElementLaw | None = None  # law of the columns, if not the named one
     acting_parameters: Parameters | None = None
     believed: Believed = lambda fitted: True  # whether values are plausible for the record
@@ -120,6 +122,11 @@ class Piece:
     def dissipates(self) -> bool:
         """Whether its force is a rate-independent hysteresis."""
         return self.kind.dissipates
+
+    @property
+    def plain(self) -> int:
+        """Prior cost: number of commoner laws it contains or imitates, by the evidence that its law states to need."""
+        return math.ceil(self.law.prior_cost / RARE) + self.rarer
 
     @property
     def effect(self) -> str:
@@ -374,6 +381,12 @@ SURFACE = SliderSurface()
 LAGS = (Lag(), Lag(filters=True))
 LawPiece = Piece | Following | Lag  # candidates of the search
 Part = LawPiece | SliderSurface
+
+
+def admissible(law: ElementLaw, name: str) -> tuple[float, float]:
+    """Limits of one of a law's parameters, as the law states them."""
+    spec = next(one for one in law.parameters if one.name == name)
+    return spec.low, spec.high
 
 
 def no_shapes(seen: MotionSizes) -> FloatArray:

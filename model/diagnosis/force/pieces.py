@@ -25,7 +25,7 @@ def _drift(law: ElementLaw, quantity: str) -> Piece:
         (0,),
         lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300), s[0]),
         lambda p: (p[1],),
-        plain=1,
+        rarer=1,  # nearly every misfit along one short motion has a trend
         believed=lambda fitted: fitted.shape[0] > fitted.rules.drift * fitted.seconds,
     )
 

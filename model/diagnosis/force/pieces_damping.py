@@ -10,6 +10,7 @@ from sprung.model.diagnosis.force.piece import (
     FittedPiece,
     MotionSizes,
     Piece,
+    admissible,
     no_shapes,
     rates_at,
     wider_form,
@@ -34,11 +35,17 @@ def _apart_from_zero(value: float) -> float:
     return value if value != 0 else 1e-300
 
 
+def _admissible_asymmetry(fitted: FittedPiece) -> bool:
+    """Whether the damper pushes the right way in both directions."""
+    low, high = admissible(DAMPER_ASYMMETRY, "a")
+    return low <= fitted.values["a"] <= high
+
+
 def _opens_late_enough(fitted: FittedPiece) -> bool:
     """A plausible valve: lower slope beyond the knee, and knees that the sampling resolves."""
     ratios = [fitted.values[name] for name in ("ratio", "ratio_compression") if name in fitted.values]
     knees = [fitted.values[name] for name in ("knee", "knee_compression") if name in fitted.values]
-    least, most = fitted.rules.valve_least, fitted.rules.valve_most
+    least, most = fitted.rules.valve_least, admissible(DAMPER_BLOWOFF, "ratio")[1]
     return all(least <= r < most for r in ratios) and all(k > fitted.corner for k in knees)
 
 
@@ -84,7 +91,6 @@ _TWO_KNEES = Piece(
     (-1, -1),
     lambda a, s, e: (s[0], 1 + a[0] / _damping(e), s[1], 1 + a[1] / _damping(e)),
     lambda p: (p[0], p[2]),
-    plain=1,
     believed=_opens_late_enough,
 )
 _ASYMMETRY = Piece(
@@ -95,7 +101,7 @@ _ASYMMETRY = Piece(
     (0,),
     lambda a, s, e: (a[0] / _damping(e),),
     lambda p: (),
-    believed=lambda fitted: abs(fitted.values["a"]) <= 1.0,
+    believed=_admissible_asymmetry,
 )
 _ASYMMETRY_OF_VALVES = Piece(
     wider_form(DAMPER_ASYMMETRY),
@@ -105,8 +111,7 @@ _ASYMMETRY_OF_VALVES = Piece(
     (0, 0),  # of the rate's magnitude, and of the part below the knee
     lambda a, s, e: ((a[0] + a[1]) / _damping(e), s[0], a[0] / _apart_from_zero(a[0] + a[1])),
     lambda p: (p[1],),
-    plain=1,
-    believed=lambda fitted: _opens_late_enough(fitted) and abs(fitted.values["a"]) <= 1.0,
+    believed=lambda fitted: _opens_late_enough(fitted) and _admissible_asymmetry(fitted),
 )
 _SERIES = Piece(
     SERIES_STIFFNESS,

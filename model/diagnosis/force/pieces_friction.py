@@ -14,6 +14,7 @@ from sprung.model.diagnosis.force.piece import (
     Piece,
     Shape,
     Values,
+    admissible,
     wider_form,
 )
 from sprung.model.diagnosis.force.pieces_damping import LOW_VALVE
@@ -88,7 +89,6 @@ _SLIDING = Piece(
     lambda p: (p[1], p[3]),
     lambda a, s, e: {"breakaway_force": (a[0], "N")},
     kind=FRICTION,
-    plain=1,
     believed=_rises,
 )
 _STRIBECK = Piece(
@@ -101,7 +101,6 @@ _STRIBECK = Piece(
     lambda p: (p[3], p[2]),
     lambda a, s, e: {"breakaway_force": (a[0] + a[1], "N")},
     kind=FRICTION,
-    plain=1,
     believed=_falls,
 )
 _DAHL = Piece(
@@ -114,7 +113,6 @@ _DAHL = Piece(
     lambda p: (p[0] / p[1],),
     _yield_words,
     kind=HYSTERESIS,
-    plain=1,
 )
 _LUGRE = Piece(
     LUGRE,
@@ -128,7 +126,6 @@ _LUGRE = Piece(
     lambda p: (p[0] / p[3], p[2], p[1] / p[0] - 1),
     _yield_words,
     kind=HYSTERESIS,
-    plain=1,
 )
 
 
@@ -148,7 +145,7 @@ _BOUC_WEN = Piece(
     BOUC_WEN,
     ("yield_displacement", "n"),
     lambda seen: grid(_yields(seen), [1.0, 2.0]),
-    lambda seen: [_yield_limits(seen), (1.0, 8.0)],
+    lambda seen: [_yield_limits(seen), admissible(BOUC_WEN, "n")],
     (1,),
     _loop,
     _loop_shape,
@@ -156,11 +153,13 @@ _BOUC_WEN = Piece(
     kind=HYSTERESIS,
     strengthened=True,
 )
+_FREE = wider_form(BOUC_WEN)
+_YIELDS = -0.95  # of gamma: below -1 it stiffens while it is loaded, and has no yield force
 _FREE_BOUC_WEN = Piece(
-    wider_form(BOUC_WEN),
+    _FREE,
     ("yield_displacement", "n", "gamma"),
     lambda seen: grid(_yields(seen)[::2], [1.0], [-0.6, 0.0, 1.5]),
-    lambda seen: [_yield_limits(seen), (1.0, 8.0), (-0.95, 4.0)],
+    lambda seen: [_yield_limits(seen), admissible(BOUC_WEN, "n"), (_YIELDS, admissible(_FREE, "gamma")[1])],
     (1,),
     _loop,
     _loop_shape,
@@ -177,7 +176,6 @@ _PINCHED = Piece(
     lambda p: (p[1], p[3]),
     lambda a, s, e: {"yield_force": (a[0], "N")},
     kind=HYSTERESIS,
-    plain=2,
 )
 
 

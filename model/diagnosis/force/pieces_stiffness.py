@@ -8,6 +8,7 @@ from sprung.model.diagnosis.force.piece import (
     ELASTIC,
     FittedPiece,
     Piece,
+    admissible,
     no_shapes,
     wider_form,
 )
@@ -64,7 +65,6 @@ _CUBIC_OFF_CENTRE = Piece(
     lambda a, s, e: (a[0], a[1]),
     lambda p: (),
     kind=ELASTIC,
-    plain=1,
     believed=_softest_within,
     imitates=True,
 )
@@ -88,7 +88,6 @@ _TWO_STOPS = Piece(
     lambda a, s, e: (s[0], a[0], s[1], a[1]),
     lambda p: (p[0], p[2]),
     kind=ELASTIC,
-    plain=1,
     believed=_stops,
     imitates=True,
 )
@@ -96,12 +95,12 @@ _PROGRESSIVE_STOP = Piece(
     PROGRESSIVE_STOP,
     ("gap", "gap_compression", "exponent"),
     lambda seen: grid(*[seen.travel * np.array([0.3, 0.5, 0.75])] * 2, [1.5, 2.5]),
-    lambda seen: [(0.25 * seen.travel, 0.97 * seen.travel)] * 2 + [(1.0, 3.5)],  # nearer, it is a progressive spring
+    # nearer, it is a progressive spring
+    lambda seen: [(0.25 * seen.travel, 0.97 * seen.travel)] * 2 + [admissible(PROGRESSIVE_STOP, "exponent")],
     (1, 1),
     lambda a, s, e: (s[0], a[0], s[1], a[1], s[2]),
     lambda p: (p[0], p[2], p[4]),
     kind=ELASTIC,
-    plain=2,
     believed=_stops,
     imitates=True,
 )
@@ -125,17 +124,15 @@ _GAS_SPRING = Piece(
     lambda a, s, e: (a[0], s[0], _POLYTROPIC),
     lambda p: (p[1],),
     kind=ELASTIC,
-    plain=1,
 )
 _FRACTIONAL = Piece(
     FRACTIONAL_STIFFNESS,
     ("order",),
     lambda seen: grid([0.1, 0.2, 0.35, 0.55]),
-    lambda seen: [(0.03, 0.9)],
+    lambda seen: [admissible(FRACTIONAL_STIFFNESS, "order")],
     (1,),
     lambda a, s, e: (a[0], s[0]),
     lambda p: (p[1],),
-    plain=1,
 )
 
 STIFFNESS_PIECES: tuple[Piece, ...] = (

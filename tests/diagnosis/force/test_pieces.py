@@ -10,6 +10,7 @@ from sprung.model.diagnosis.force.piece import HYSTERESIS, MotionSizes, Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
+from sprung.model.laws.base import RARE
 
 STRENGTHS = (300.0, 500.0)
 ELEMENT = SpringDamper(STRENGTHS[0], 900.0)  # within a clearance nothing of a spring is left: its strength is that
@@ -61,3 +62,14 @@ def test_columns_times_strengths_are_the_force_of_the_acting_law(piece: Piece, m
     found = piece.columns(motion, shape) @ sizes
     assert np.abs(found - force).max() < 1e-6 * np.abs(force).max()
     assert np.abs(force).max() > 0.0
+
+
+@pytest.mark.parametrize("piece", PIECES, ids=lambda piece: piece.key)
+def test_a_piece_costs_what_its_law_needs_and_searches_no_further_than_its_law_admits(
+    piece: Piece, motion: ElementMotion
+) -> None:
+    assert piece.plain == piece.law.prior_cost / RARE + piece.rarer
+    stated = {spec.name: spec for spec in piece.law.parameters}
+    for name, (low, high) in zip(piece.shapes, piece.limits(MotionSizes.of(motion)), strict=True):
+        if name in stated:
+            assert stated[name].low <= low < high <= stated[name].high
