@@ -32,6 +32,7 @@ from sprung.model.diagnosis.selection.evidence import (
 from sprung.model.diagnosis.selection.starts import alike_starts, starts_of
 
 _STEPS = 6  # from a start along the measured motion
+_FINISHING = 10  # of a first fit that is finished
 
 
 @dataclass(frozen=True)
@@ -157,12 +158,17 @@ def _initial_fits(problem: Problem, base: Fit, candidates: list[Candidate], know
 
 
 def _leading(problem: Problem, trials: list[Trial]) -> tuple[list[Trial], list[Trial]]:
-    """The trials, best first, whose fits are to be finished, and the others."""
-    rules, best = problem.rules.selection, trials[0].evidence
+    """The trials, best first, whose fits are to be finished, and the others.
+
+    Of fits that are far behind, the first few are finished if steps like their last one would bring them to the lead:
+    from some starts the first steps are too few for their evidence to tell, and later ones are shorter.
+    """
+    rules, best, least = problem.rules.selection, trials[0].evidence, trials[0].fit.chi_square
     leading, behind = [], []
     for rank, trial in enumerate(trials):
         close = problem.process_noise or trial.evidence > best - max(rules.near, rules.near_share * abs(best))
-        if rank < rules.last or (rank < rules.finished and close):
+        falling = trial.fit.converged or trial.fit.chi_square - _FINISHING * trial.fit.left < least
+        if (rank < rules.last and falling) or (rank < rules.finished and close):
             leading.append(trial)
         else:
             behind.append(replace(trial, finished=False))
@@ -289,7 +295,7 @@ def _converged_fit(problem: Problem, base: Fit, trial: Trial) -> Trial:
     """A trial fitted to convergence; with measured forces their noise level is estimated anew, now beside the law."""
     if trial.fit.converged and not problem.process_noise:
         return trial
-    finished = _try(problem, base, trial.candidate, trial.fit.point, 10) or trial
+    finished = _try(problem, base, trial.candidate, trial.fit.point, _FINISHING) or trial
     if not problem.process_noise or finished.fit.deviance > base.deviance:
         return finished
     _, fit = refreshed(problem, finished.fit)
