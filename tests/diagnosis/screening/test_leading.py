@@ -47,9 +47,15 @@ def test_a_law_of_an_element_leads_there(law: Callable[[float, float], float], n
 
 @pytest.mark.parametrize(
     ("column", "place", "effect"),
-    [(CAR_B, "car_b", "sensor_gain"), (BOGIE_A, "bogie_a", "sensor_gain"), (BOGIE_B, "bogie_b", "sensor_lag")],
+    [
+        (CAR_B, "car_b", "sensor_gain"),
+        (BOGIE_A, "bogie_a", "sensor_gain"),
+        (BOGIE_B, "bogie_b", "sensor_lag"),
+        (ROAD, "wheel.displacement", "sensor_gain"),  # which the velocity beside it contradicts
+        (RATE, "wheel.velocity", "sensor_gain"),
+    ],
 )
-def test_a_fault_of_a_sensor_leads_at_that_sensor(column: int, place: str, effect: str) -> None:
+def test_a_fault_of_a_channel_leads_at_that_channel(column: int, place: str, effect: str) -> None:
     record = simulate(seconds=12, seed=4)
     if effect == "sensor_gain":
         record.values[:, column] *= 1.05
