@@ -74,9 +74,9 @@ SAME = (
     SameRows("pendulum", "quick", "9e2624087112", "a2951359b567", _FULL_ALONE),
     SameRows("mass_spring_damper", "quick", "b7dff46cd836", "50f03443cbf3", _FULL_ALONE),
     SameRows("two_body", "quick", "8c92e59ff7de", "0f743c0a968c", _FULL_ALONE),
-    SameRows("train", "quick", "f287e44a1c01", "863271f0e672", _MOVED_AWAY),
-    SameRows("train_changing", "quick", "4abf4968f801", "2c64b44c805e", _MOVED_AWAY),
-    SameRows("train_drifting", "quick", "98e93f63950d", "21fecfea6a2a", _MOVED_AWAY),
+    SameRows("train", "quick", "f287e44a1c01", "0e99d5a3f76b", _MOVED_AWAY),
+    SameRows("train_changing", "quick", "4abf4968f801", "79d85bdd3151", _MOVED_AWAY),
+    SameRows("train_drifting", "quick", "98e93f63950d", "049eda81548d", _MOVED_AWAY),
 )
 
 

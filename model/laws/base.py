@@ -141,7 +141,7 @@ class Parametrised:
         return ()
 
     @property
-    def told_apart_by(self) -> str:
+    def discriminated_by(self) -> str:
         """The experiment that would distinguish it from its look-alikes."""
         return "a longer recording, or one at a higher level (worse track, more speed or load),"
 
@@ -284,10 +284,10 @@ class ElementLaw(Parametrised):
         return () if self.strength is None or not self.named else (self.strength,)
 
     @property
-    def told_apart_by(self) -> str:
+    def discriminated_by(self) -> str:
         if self.memory:
             return "a recording at another speed, so that the same deflections come at other rates,"
-        return super().told_apart_by
+        return super().discriminated_by
 
     def clip(self, p: Sequence[float]) -> FloatArray:
         """Nearest admissible values, shape (P,)."""

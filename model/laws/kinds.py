@@ -181,7 +181,7 @@ class SensorLaw(Parametrised):
         return alone and self.slope() == SensorResponse(0.0, 0.0, 1.0, 0.0)
 
     @property
-    def told_apart_by(self) -> str:
+    def discriminated_by(self) -> str:
         return "a calibration of the sensor"
 
     def distort(self, truth: FloatArray, p: Values, sample_rate: float) -> FloatArray:

@@ -56,7 +56,7 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
         baseline=reported_parameters(state.system, state.base),
         baseline_validation=figures(names, before.per_sensor),
         findings=tuple(findings),
-        augmented=reported_parameters(state.system, outcome.final, _told(outcome)),
+        augmented=reported_parameters(state.system, outcome.final, _reported(outcome)),
         augmented_validation=figures(names, after.per_sensor),
         noise_floor=figures(names, judgement.errors.floor),
         localization=state.first.localization(),
@@ -73,7 +73,7 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
     )
 
 
-def _told(outcome: Outcome) -> int:
+def _reported(outcome: Outcome) -> int:
     """How many of the final model's first laws are reported; the others are not believed."""
     state = outcome.investigation
     return state.given + (len(state.found) if outcome.judgement.carried else 0)
@@ -87,7 +87,7 @@ def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[Ide
     reported = {(one.location, one.effect) for one in calibration}
     fit, state = outcome.final, outcome.investigation
     found = []
-    for index, term in enumerate(fit.point.terms[: _told(outcome)]):
+    for index, term in enumerate(fit.point.terms[: _reported(outcome)]):
         moot = index in calibration_indices(state) and (term.location, term.law.name) not in reported
         everywhere = term.law.branches is not None  # cannot be expressed in a system file
         if term.law.named and not moot and not everywhere:
@@ -132,7 +132,7 @@ def _changes(outcome: Outcome) -> tuple[str, ...]:
     """Parameters whose estimates differ from nominal, in words."""
     state, final = outcome.investigation, outcome.final
     rules = state.options.rules.report
-    sigma, theta = deviations(state.system, final, _told(outcome)), final.point.theta
+    sigma, theta = deviations(state.system, final, _reported(outcome)), final.point.theta
     words = []
     order = sorted(range(len(theta)), key=lambda i: -abs(theta[i]))
     for i in order:

@@ -118,7 +118,10 @@ def _look_alikes(found: AcceptedFinding, rules: Rules) -> tuple[str | None, str 
     if not near:
         return None, None
     names = " or ".join([best.term.law.name, *dict.fromkeys(t.term.law.name for t in near)])
-    return names, f"{names} fit this recording almost equally well; {best.term.law.told_apart_by} would tell them apart"
+    return (
+        names,
+        f"{names} fit this recording almost equally well; {best.term.law.discriminated_by} would tell them apart",
+    )
 
 
 def _elsewhere(found: AcceptedFinding, rules: ReportRules) -> tuple[str, ...]:

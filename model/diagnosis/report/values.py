@@ -33,22 +33,22 @@ def figures(names: Sequence[str], per_sensor: FloatArray) -> FitFigures:
     )
 
 
-def deviations(system: System, fit: Fit, told: int | None = None) -> FloatArray:
+def deviations(system: System, fit: Fit, reported: int | None = None) -> FloatArray:
     """Standard deviations of the log-ratios, (P,).
 
     The division between a force that no law of the catalogue explains and the spring and damper beside it is a
     convention: their values are uncertain by what the force would change them.  A spring that is stiffer beyond a gap
     has another stiffness within it.
 
-    told: how many of the first laws are reported, by default all.  One that is not is a force without a name, too.
+    reported: how many of the first laws are reported, by default all.  One that is not is a force without a name, too.
     """
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0))[: len(system.parameters)]
     in_time = [number for number, term in enumerate(fit.point.terms) if evaluated_in_time(term)]
     for i, term in enumerate(fit.forces.terms if fit.forces is not None else ()):
-        untold = told is not None and in_time[i] >= told
-        if (term.law.listed and not untold) or fit.forces is None:
+        unreported = reported is not None and in_time[i] >= reported
+        if (term.law.listed and not unreported) or fit.forces is None:
             continue
-        for quantity, share in _linear_shares(fit, fit.forces, i, whole=untold or not term.law.named).items():
+        for quantity, share in _linear_shares(fit, fit.forces, i, whole=unreported or not term.law.named).items():
             for j, parameter in enumerate(system.parameters):
                 if parameter.element == term.location and parameter.quantity == quantity:
                     value = parameter.nominal * np.exp(fit.point.theta[j])
@@ -80,9 +80,9 @@ def _linear_shares(fit: Fit, forces: LawForces, index: int, *, whole: bool) -> d
     return {name: max(shares[name], float(np.sqrt(np.mean(slope**2)))) for name, slope in slopes}
 
 
-def reported_parameters(system: System, fit: Fit, told: int | None = None) -> tuple[ReportedParameter, ...]:
-    """Values of a fit with their deviations; told: how many of the first laws are reported, by default all."""
-    sigma = deviations(system, fit, told)
+def reported_parameters(system: System, fit: Fit, reported: int | None = None) -> tuple[ReportedParameter, ...]:
+    """Values of a fit with their deviations; reported: how many of the first laws are reported, by default all."""
+    sigma = deviations(system, fit, reported)
     values = []
     for i, parameter in enumerate(system.parameters):
         value = parameter.nominal * float(np.exp(fit.point.theta[i]))

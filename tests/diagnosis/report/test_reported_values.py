@@ -78,10 +78,10 @@ def fit_with(term: Term) -> Any:
     )
 
 
-def log_deviation(fit: Any, quantity: str, told: int | None = None) -> float:
+def log_deviation(fit: Any, quantity: str, reported: int | None = None) -> float:
     system = quarter_car()
     at = [parameter.name for parameter in system.parameters].index(f"secondary.{quantity}")
-    return float(deviations(system, fit, told)[at])
+    return float(deviations(system, fit, reported)[at])
 
 
 def test_beside_a_stop_that_is_not_reported_a_spring_may_be_as_stiff_as_it_is_beyond_the_gap() -> None:
@@ -90,7 +90,7 @@ def test_beside_a_stop_that_is_not_reported_a_spring_may_be_as_stiff_as_it_is_be
     nominal = next(p.nominal for p in quarter_car().parameters if p.name == "secondary.stiffness")
     beyond = np.mean(np.abs(DEFLECTION) > gap)
     assert log_deviation(fit, "stiffness") == pytest.approx(1e-3)
-    assert log_deviation(fit, "stiffness", told=0) == pytest.approx(stop * np.sqrt(beyond) / nominal, rel=0.02)
+    assert log_deviation(fit, "stiffness", reported=0) == pytest.approx(stop * np.sqrt(beyond) / nominal, rel=0.02)
 
 
 def test_a_spring_is_as_uncertain_as_the_slopes_of_an_unnamed_force_beside_it() -> None:

@@ -1,4 +1,4 @@
-"""The same force in other words: a law that is told as another one, beside a likelier spring.
+"""The same force in other words: a law that is restated as another one, beside a likelier spring.
 
 A spring with a clearance, and stops without a spring between them, are the same curve.  Beside other laws at the same
 element, a stop may be found first, while the spring still stands for some of what these do; once they are found as
@@ -31,7 +31,7 @@ _STEPS = 10  # of a fit in other words
 
 
 def restated(state: Investigation) -> Investigation:
-    """The investigation with laws told as others that say the same of a likelier spring and damper.
+    """The investigation with laws restated as others that say the same of a likelier spring and damper.
 
     A finding that stays as it is keeps the other law among its rivals, with the evidence by which it lost.
     """
@@ -40,13 +40,13 @@ def restated(state: Investigation) -> Investigation:
     for index, found in enumerate(state.found):
         at = state.given + index
         for start in _restatements(state.problem, state.fit, at):
-            told = try_optimise(state.problem, start, _STEPS, state.fit.whitener)
-            trial = None if told is None else _as_trial(state, found, start.terms[at].law.name)
-            if told is None or trial is None:
+            refitted = try_optimise(state.problem, start, _STEPS, state.fit.whitener)
+            trial = None if refitted is None else _as_trial(state, found, start.terms[at].law.name)
+            if refitted is None or trial is None:
                 continue
-            margin = _margin(state, told, at)
-            if margin > 0 and not state.refutes(told):
-                state = _adopted(state, told, index, replace(trial, evidence=found.trial.evidence + margin))
+            margin = _margin(state, refitted, at)
+            if margin > 0 and not state.refutes(refitted):
+                state = _adopted(state, refitted, index, replace(trial, evidence=found.trial.evidence + margin))
                 return restated(state)
             lost = replace(trial, evidence=found.trial.evidence + min(margin, 0.0))
             state = _with_finding(state, index, replace(found, trials=(*_others(found, lost), lost)))
@@ -76,28 +76,30 @@ def _restatements(problem: Problem, base: Fit, index: int) -> Iterator[Point]:
 
 
 def _started(base: Fit, index: int, other: Restatement, theta: np.ndarray) -> Point:
-    """The model with a law told as another one, beside other springs and dampers."""
+    """The model with a law restated as another one, beside other springs and dampers."""
     terms, term = base.point.terms, base.point.terms[index]
     port, grid = term.port(base.forward.system), base.forward.part.grid
     d, v = (motion @ port for motion in base.element_motion)
     motion = seen(base, term, other.element)
     scales = tuple(max(abs(spec.typical(motion)), 1e-12) for spec in other.law.parameters)
-    told = Term(other.law, term.location, other.parameters, scales=scales)
+    replacement = Term(other.law, term.location, other.parameters, scales=scales)
     near = list(base.point.warm_start)
     place = sum(evaluated_in_time(one) for one in terms[:index])
     if place < len(near):
         near[place] = force_along(other.law, other.parameters, d, v, grid.start + grid.fine_time, other.element)
-    terms = (*terms[:index], told, *terms[index + 1 :])
+    terms = (*terms[:index], replacement, *terms[index + 1 :])
     return replace(base.point, theta=theta, terms=terms, warm_start=tuple(near))
 
 
-def _margin(state: Investigation, told: Fit, at: int) -> float:
+def _margin(state: Investigation, refitted: Fit, at: int) -> float:
     """Evidence of a model with a law in other words over the present one, with the priors of springs and dampers."""
     base, rules = state.fit, state.options.rules
-    gain = profile_gain(base.residual, told.residual, len(state.problem.sensors), rules.evidence.quiet, rules.evidence)
-    gain = min(gain, base.chi_square - told.chi_square)
-    nearer = float(np.sum(base.point.theta**2) - np.sum(told.point.theta**2)) / rules.fit.prior**2
-    return gain + nearer + cost(base, rules.evidence, at) - cost(told, rules.evidence, at)
+    gain = profile_gain(
+        base.residual, refitted.residual, len(state.problem.sensors), rules.evidence.quiet, rules.evidence
+    )
+    gain = min(gain, base.chi_square - refitted.chi_square)
+    nearer = float(np.sum(base.point.theta**2) - np.sum(refitted.point.theta**2)) / rules.fit.prior**2
+    return gain + nearer + cost(base, rules.evidence, at) - cost(refitted, rules.evidence, at)
 
 
 def _as_trial(state: Investigation, found: AcceptedFinding, name: str) -> Trial | None:
@@ -119,14 +121,14 @@ def _as_trial(state: Investigation, found: AcceptedFinding, name: str) -> Trial 
     return None
 
 
-def _adopted(state: Investigation, told: Fit, index: int, trial: Trial) -> Investigation:
+def _adopted(state: Investigation, refitted: Fit, index: int, trial: Trial) -> Investigation:
     """The investigation with one of its findings in other words."""
     found = state.found[index]
     runner_up = found.runner_up
     if runner_up is not None and runner_up.term.law.name == trial.term.law.name:
         runner_up = found.trial
     found = replace(found, trial=trial, trials=(*_others(found, trial), found.trial), runner_up=runner_up)
-    return _with_finding(with_model(state, told), index, found)
+    return _with_finding(with_model(state, refitted), index, found)
 
 
 def _others(found: AcceptedFinding, trial: Trial) -> tuple[Trial, ...]:
