@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from sprung.model.diagnosis.force.deviations import moved_in_common
 from sprung.model.diagnosis.force.fit import ComponentFit, refined
 from sprung.model.diagnosis.force.low_valve import low_valve
+from sprung.model.diagnosis.force.piece import Lag, Part
 from sprung.model.diagnosis.force.search import Step, plausible
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray
@@ -51,6 +52,15 @@ def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple
                     [one] if other.evidence > near or (plausible(one.fit, index) and _as_well(one.fit, here)) else []
                 )
     return tuple(found)
+
+
+def gives_way(final: ComponentFit, piece: Part) -> bool:
+    """Whether a lag of the force may be a damper that gives way: oil or rubber behind a valve delays its force, too.
+
+    Along one loop nothing tells them apart; at another rate a delay stays the same time, and a compliance does not.
+    """
+    beside = any(one is not piece and not isinstance(one, Lag) for one in final.model.pieces)
+    return isinstance(piece, Lag) and beside and final.task.motion.repeats(final.task.rules)
 
 
 def _as_well(other: ComponentFit, found: ComponentFit) -> bool:

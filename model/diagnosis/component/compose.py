@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sprung.model.diagnosis.component.alike import gives_way
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.judgement import ComponentJudgement, JudgedComponent
 from sprung.model.diagnosis.component.words import (
@@ -33,6 +34,7 @@ from sprung.model.diagnosis.report.report import (
 )
 from sprung.model.diagnosis.report.values import figures
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
+from sprung.model.laws.hysteresis import SERIES_STIFFNESS
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -88,6 +90,7 @@ def _findings(one: JudgedComponent) -> list[Finding]:
         sigma = spread(one.final, index, full, names)
         others = [other.effect for other in one.alike if other.index == index]
         piece = one.final.model.pieces[index]
+        others += [SERIES_STIFFNESS.name] if gives_way(one.final, piece) else []
         if isinstance(piece, Lag):
             late = LawParameter("time", one.final.model.shapes[index][0], float(sigma[0][0]), "s")
             where = one.record.sensor, one.record.element
