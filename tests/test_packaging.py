@@ -225,7 +225,7 @@ def test_the_steps_of_the_image_make_a_service_that_answers(tmp_path: Path) -> N
     environment |= {"PATH": f"{prefix}/bin:{environment['PATH']}", "SPRUNG_HOST": "127.0.0.1", "SPRUNG_PORT": "18743"}
     with subprocess.Popen(command, cwd=home, env=environment) as process:
         try:
-            for _ in range(60):
+            for _ in range(600):  # a refusal comes at once: the service may need many on a busy machine
                 healthy = subprocess.run(check, env=environment, cwd=home, capture_output=True, check=False).returncode
                 if healthy == 0 or process.poll() is not None:
                     break
