@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sprung.model.diagnosis.force.deviations import moved_in_common
 from sprung.model.diagnosis.force.fit import ComponentFit, refined
 from sprung.model.diagnosis.force.low_valve import low_valve
-from sprung.model.diagnosis.force.piece import Lag, Part
+from sprung.model.diagnosis.force.piece import Lag, Part, Piece
 from sprung.model.diagnosis.force.search import Step, plausible
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray
@@ -57,10 +57,11 @@ def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple
 def gives_way(final: ComponentFit, piece: Part) -> bool:
     """Whether a lag of the force may be a damper that gives way: oil or rubber behind a valve delays its force, too.
 
-    Along one loop nothing tells them apart; at another rate a delay stays the same time, and a compliance does not.
+    Where the motion is slow beside the lag, both turn the phase of the force alike, and differ in its size by the
+    square of that angle; a valve or friction beside them takes up the rest.
     """
-    beside = any(one is not piece and not isinstance(one, Lag) for one in final.model.pieces)
-    return isinstance(piece, Lag) and beside and final.task.motion.repeats(final.task.rules)
+    others = [one for one in final.model.pieces if isinstance(one, Piece)]
+    return isinstance(piece, Lag) and any(one.dissipates or one.law.knees for one in others)
 
 
 def _as_well(other: ComponentFit, found: ComponentFit) -> bool:
