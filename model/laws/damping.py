@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import gamma, pi, sqrt
 from statistics import NormalDist
 
 import numpy as np
@@ -265,6 +266,22 @@ def _typical_at_unit_rate(seen: Observed) -> float:
     return 0.3 * seen.damping * float(np.sqrt(max(seen.rate_rms, 1e-12)))
 
 
+_FRACTIONS, _LEFT = (0.3, 0.6), 0.05  # exponents to begin with; of the damper that was read, beside them
+
+
+def _read_as_linear(read: FittedElement) -> tuple[Restart, ...]:
+    """Fluid dampers that are read as this linear one: by the mean slope over a normal rate of the same size.
+
+    The mean slope of C abs(v)^a is C r^(a - 1) E abs(x)^(a + 1), x normal (statistical linearisation, Booton 1954).
+    """
+    starts = []
+    for exponent in _FRACTIONS:
+        moment = 2 ** ((exponent + 1) / 2) * gamma(exponent / 2 + 1) / sqrt(pi)
+        force = (1 - _LEFT) * read.damping * read.rate ** (1 - exponent) / moment
+        starts.append(Restart(1.0, _LEFT, (force, exponent, 0.05 * read.rate)))
+    return tuple(starts)
+
+
 # Fluid through shaped orifices, as in dampers of buildings and bridges (Constantinou and Symans 1993)
 POWER_LAW_DAMPING = ElementLaw(
     name="power_law_damping",
@@ -291,5 +308,5 @@ POWER_LAW_DAMPING = ElementLaw(
     confused_with=("coulomb_friction", "damper_blowoff"),
     sentence="the damper has a force of {force} at 1 m/s, with the rate to the power of {exponent}",
     prior_cost=RARE,
-    screened=False,
+    restarts=_read_as_linear,
 )

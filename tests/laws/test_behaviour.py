@@ -112,7 +112,6 @@ def test_laws_of_rigs_are_no_candidates_for_a_vehicle() -> None:
         "friction_backlash",
         "gas_spring",
         "progressive_stop",
-        "power_law_damping",
         "preload",
     }
     assert wider_law("bouc_wen").prior_cost == RARE
@@ -128,3 +127,14 @@ def test_a_cycle_of_a_fluid_damper_takes_the_energy_of_a_power_of_the_rate(expon
     energy = float(np.trapezoid(force, d))
     share = 4 * 2**exponent * gamma(1 + exponent / 2) ** 2 / gamma(2 + exponent)
     assert energy == pytest.approx(share * 3e3 * rate**exponent * amplitude, rel=1e-3)
+
+
+def test_a_fluid_damper_is_started_from_one_whose_mean_slope_is_what_was_read() -> None:
+    read = FittedElement(stiffness=4e5, damping=8e3, nominal_damping=2e4, frequency=12.0, rate=0.05)
+    law = element_law("power_law_damping")
+    assert law.restarts is not None
+    v = read.rate * np.random.default_rng(0).standard_normal(400_000)
+    for restart in law.restarts(read):
+        force = force_along(law, restart.parameters, v, v, v, SpringDamper(0.0, 0.0))
+        slope = restart.damping * read.damping + float(np.mean(force * v) / np.mean(v * v))
+        assert slope == pytest.approx(read.damping, rel=0.01)
