@@ -1,7 +1,8 @@
 """`sprung bench shaken [--seed 1] [--rigs building,yielding]`: buildings on shaken ground, frames, cars on a road.
 
 Shear buildings under motion like an earthquake's, with every storey a few percent off the system file's values: as the
-file says, with one floor heavier, with a storey that yields, with bending that couples more than neighbouring storeys.
+file says, with one floor heavier, with a storey that yields, with bending that couples more than neighbouring storeys,
+with a fluid damper.
 Frames under a measured force whose modes are damped on their own, one of them with a heavier plate.  Slabs on sliding
 bearings.  Quarter cars with stops and with an asymmetric damper that blows off.  Integrated here (Runge-Kutta, four
 steps a sample, forty of bearings), frames by their exact response.  For each: verdict, findings, held-out error before
@@ -69,7 +70,7 @@ def building(storeys: int, kind: str, seed: int, seconds: float = SECONDS) -> Sh
     """A shear building, its ground's acceleration and those of all floors measured at 100 Hz.
 
     kind: "as stated", "heavier" (the middle floor by 35 %), "yielding" (the second storey, beyond a third of its
-    drift), "bending" (through all storeys).
+    drift), "bending" (through all storeys), "fluid" (a damper in the first storey, with the rate to the power of 0.35).
     """
     random, rate = np.random.default_rng([seed, storeys]), 100.0
     mass = np.full(storeys, random.uniform(2e3, 3e5))
@@ -81,10 +82,14 @@ def building(storeys: int, kind: str, seed: int, seconds: float = SECONDS) -> Sh
     bending = (0.15 * nominal if kind == "bending" else 0.0) * curve.T @ curve
     ground = earthquake(int(seconds * rate), rate, random)
 
+    usual = 0.05 * float(np.std(ground))  # m/s, of a storey, about
+    fluid = 3 * damping[0] * usual**0.65 if kind == "fluid" else 0.0  # N at 1 m/s
+
     def rates(x: Array, pushed: Array, yields: float = np.inf) -> Array:
         q, v, z = x[:storeys], x[storeys:-1], x[-1]
         drift, speed = np.diff(q, prepend=0.0), np.diff(v, prepend=0.0)
         force = stiffness * drift + damping * speed
+        force[0] += fluid * speed[0] * (speed[0] ** 2 + (0.01 * usual) ** 2) ** -0.325
         force[1] -= 0.85 * stiffness[1] * (drift[1] - z) if yields < np.inf else 0.0
         left = 0.5 * (1 + np.sign(z * speed[1])) * (z / yields) ** 2  # Bouc and Wen's slider
         pulled = np.append(force[1:], 0.0) - force - bending @ q
@@ -293,6 +298,7 @@ RIGS: dict[str, Callable[[int], ShakenRig]] = {
     "heavier": lambda seed: building(6, "heavier", seed),
     "yielding": lambda seed: building(5, "yielding", seed),
     "bending": lambda seed: building(8, "bending", seed),
+    "fluid damper": lambda seed: building(4, "fluid", seed),
     "frame": lambda seed: frame(False, seed),
     "heavier frame": lambda seed: frame(True, seed),
     "sliding bearings": lambda seed: slab(0.4, seed),
