@@ -1,8 +1,7 @@
 """Friction with a wide transition and a valve that opens at low rates, which are often indistinguishable.
 
 The search does not try valves with knees below usual rates, where they act like friction.  A friction that was found is
-therefore compared with such a valve here: it takes the friction's place where it is plainly likelier, as on a sweep
-whose slow beginning shows its knees.
+therefore compared with such a valve here.
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ from sprung.model.diagnosis.force.fit import (
     fitted,
     refined,
 )
-from sprung.model.diagnosis.force.low_valve import low_valve
 from sprung.model.diagnosis.force.piece import LAGS, FittedPiece, Following, Lag, LawPiece, Part
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.pieces_following import pieces_following
@@ -399,10 +398,7 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
 
 
 def _formed(chosen: Ranked, rules: ComponentRules, given: int) -> Ranked:
-    """The same with laws in another form, if that gains the naming margin in evidence.
-
-    That is another dependence on a signal, or a valve that opens at low rates in the place of a friction.
-    """
+    """The same with laws that follow a signal in another form, if that gains the naming margin in evidence."""
     best = chosen
     for index in range(given, len(chosen.fit.model.pieces)):
         others = _other_forms(best.fit, index)
@@ -417,11 +413,10 @@ def _formed(chosen: Ranked, rules: ComponentRules, given: int) -> Ranked:
 
 
 def _other_forms(fit: ComponentFit, index: int) -> list[ComponentFit]:
-    """Fits with another form of a law."""
+    """Fits with another dependence of a law on its signal."""
     model, piece = fit.model, fit.model.pieces[index]
     if not isinstance(piece, Following):
-        valve = low_valve(fit, index)
-        return [] if valve is None else [valve]
+        return []
     strengths, shape = fit.strengths_of(index), model.shapes[index]
     starts = ((form, start) for form in piece.forms for start in form.starts(strengths, shape))
     others = [refined(fit.task, model.replaced(index, form, start)) for form, start in starts]
