@@ -266,20 +266,17 @@ def _typical_at_unit_rate(seen: Observed) -> float:
     return 0.3 * seen.damping * float(np.sqrt(max(seen.rate_rms, 1e-12)))
 
 
-_FRACTIONS, _LEFT = (0.3, 0.6), 0.05  # exponents to begin with; of the damper that was read, beside them
+_EXPONENT, _LEFT = 0.4, 0.05  # to begin with; of the damper that was read, beside it
 
 
 def _read_as_linear(read: FittedElement) -> tuple[Restart, ...]:
-    """Fluid dampers that are read as this linear one: by the mean slope over a normal rate of the same size.
+    """A fluid damper that is read as this linear one: by the mean slope over a normal rate of the same size.
 
     The mean slope of C abs(v)^a is C r^(a - 1) E abs(x)^(a + 1), x normal (statistical linearisation, Booton 1954).
     """
-    starts = []
-    for exponent in _FRACTIONS:
-        moment = 2 ** ((exponent + 1) / 2) * gamma(exponent / 2 + 1) / sqrt(pi)
-        force = (1 - _LEFT) * read.damping * read.rate ** (1 - exponent) / moment
-        starts.append(Restart(1.0, _LEFT, (force, exponent, 0.05 * read.rate)))
-    return tuple(starts)
+    moment = 2 ** ((_EXPONENT + 1) / 2) * gamma(_EXPONENT / 2 + 1) / sqrt(pi)
+    force = (1 - _LEFT) * read.damping * read.rate ** (1 - _EXPONENT) / moment
+    return (Restart(1.0, _LEFT, (force, _EXPONENT, 0.05 * read.rate)),)
 
 
 # Fluid through shaped orifices, as in dampers of buildings and bridges (Constantinou and Symans 1993)
