@@ -21,6 +21,17 @@ from sprung.model.laws.base import (
 from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.signals import FloatArray
 
+SMOOTHING = ParameterSpec(
+    "smoothing",
+    "m/s",
+    1e-6,
+    10.0,
+    "rate over which the force changes sign",
+    lambda seen: 0.05 * seen.rate_rms,
+    log=True,
+    minor=True,
+)
+
 
 def _coulomb(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     force, smoothing = p
@@ -57,17 +68,7 @@ _COULOMB = ElementLaw(
     title="dry friction",
     parameters=(
         ParameterSpec("force", "N", 0.0, 1e9, "friction force", lambda seen: _coulomb_shapes(seen)[0, 0]),
-        ParameterSpec(
-            "smoothing",
-            "m/s",
-            1e-6,
-            10.0,
-            "rate over which the force changes sign",
-            lambda seen: 0.05 * seen.rate_rms,
-            log=True,
-            usual=(0.0, 4.0),  # wider, it is a damper that saturates
-            minor=True,
-        ),
+        replace(SMOOTHING, usual=(0.0, 4.0)),  # wider, it is a damper that saturates
     ),
     force=_coulomb,
     shapes=_coulomb_shapes,
@@ -286,16 +287,7 @@ POWER_LAW_DAMPING = ElementLaw(
     parameters=(
         ParameterSpec("force", "N", 0.0, 1e12, "force at 1 m/s", _typical_at_unit_rate),
         ParameterSpec("exponent", "1", 0.1, 0.95, "of the rate: 1 is a linear damper", lambda seen: 0.5),
-        ParameterSpec(
-            "smoothing",
-            "m/s",
-            1e-6,
-            10.0,
-            "rate below which the force is linear",
-            lambda seen: 0.05 * seen.rate_rms,
-            log=True,
-            minor=True,
-        ),
+        replace(SMOOTHING, meaning="rate below which the force is linear"),
     ),
     force=_power,
     formula="force * v * (v ** 2 + smoothing ** 2) ** ((exponent - 1) / 2)",

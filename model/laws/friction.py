@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from sprung.model.laws.base import RARE, ElementLaw, ParameterSpec, Values, grid
+from sprung.model.laws.damping import SMOOTHING
 from sprung.model.laws.motion import Motion, Observed, SpringDamper
 from sprung.model.laws.paths import presliding_path
 from sprung.model.signals import FloatArray
@@ -50,16 +51,7 @@ STRIBECK = ElementLaw(
         _FORCE,
         _STATIC,
         _FALL,
-        ParameterSpec(
-            "smoothing",
-            "m/s",
-            1e-6,
-            10.0,
-            "rate over which the force changes sign",
-            lambda seen: 0.05 * seen.rate_rms,
-            log=True,
-            minor=True,
-        ),
+        SMOOTHING,
     ),
     force=_stribeck,
     formula="tanh(v / smoothing) * (force + (static_force - force) * exp(-((v / stribeck_rate) ** 2)))",

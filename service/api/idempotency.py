@@ -91,10 +91,8 @@ class IdempotentRequests:
             response = await act()
             try:
                 await run_in_threadpool(self._keep, response)
-            except (
-                SQLAlchemyError,
-                OSError,
-            ) as error:  # it is done: told otherwise, the client would have it done twice
+            except (SQLAlchemyError, OSError) as error:
+                # it is done: told otherwise, the client would have it done twice
                 log.warning("the answer to an Idempotency-Key is not kept: %s", first_line(error))
             return response
 

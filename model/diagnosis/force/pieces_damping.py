@@ -19,7 +19,7 @@ from sprung.model.laws import SpringDamper, grid
 from sprung.model.laws.damping import DAMPER_ASYMMETRY, DAMPER_BLOWOFF, POWER_LAW_DAMPING, QUADRATIC_DAMPING
 from sprung.model.laws.hysteresis import AIR_SPRING, SERIES_STIFFNESS
 
-_EXPONENT = POWER_LAW_DAMPING.parameters[1]
+_EXPONENT = admissible(POWER_LAW_DAMPING, "exponent")
 _LOW = 0.02  # of the lowest knee that is searched: no limit beside what the motion resolves
 
 
@@ -63,12 +63,12 @@ _POWER = Piece(
     POWER_LAW_DAMPING,
     ("exponent", "smoothing"),
     lambda seen: grid([0.15, 0.3, 0.45, 0.6, 0.8], seen.rate_rms * np.array([0.005, 0.1])),
-    lambda seen: [(_EXPONENT.low, _EXPONENT.high), (1e-3 * seen.rate_rms, 0.5 * seen.rate_rms)],
+    lambda seen: [_EXPONENT, (1e-3 * seen.rate_rms, 0.5 * seen.rate_rms)],
     (1,),
     lambda a, s, e: (a[0], s[0], s[1]),
     lambda p: (p[1], p[2]),
     lambda a, s, e: {"force_at_0.1_m/s": (a[0] * 0.1 ** s[0], "N")},
-    believed=lambda fitted: _EXPONENT.low < fitted.shape[0] < _EXPONENT.high,
+    believed=lambda fitted: _EXPONENT[0] < fitted.shape[0] < _EXPONENT[1],
     strengthened=True,
 )
 _BLOWOFF = Piece(

@@ -88,6 +88,13 @@ class Failing(Ingest):
         return super().take(found)
 
 
+def opening(kafka: FakeKafka, *errors: tuple[type[Exception], ...]) -> Callable[[], Awaitable[Broker]]:
+    async def opened() -> Broker:
+        return KafkaBroker(kafka, *errors)
+
+    return opened
+
+
 async def until(
     open_broker: Callable[[], Awaitable[Broker]], ingest: Ingest, counts: ConsumerCounts, ends: Callable[[], bool]
 ) -> None:
@@ -110,11 +117,8 @@ def test_kafka_commits_after_the_store_did_and_reads_again_what_it_did_not(
     kafka = FakeKafka([bodies[0], b"nonsense", *bodies[1:]])
     counts = ConsumerCounts()
 
-    async def opened() -> Broker:
-        return KafkaBroker(kafka)
-
     ingest = Failing(pipeline, 0.0, Clock())
-    asyncio.run(until(opened, ingest, counts, lambda: kafka.committed == 5))
+    asyncio.run(until(opening(kafka), ingest, counts, lambda: kafka.committed == 5))
     assert pipeline.state("north-1").used == 40
     assert counts.again == 8 and counts.refused >= 1
     assert kafka.commits == sorted(kafka.commits)
@@ -127,10 +131,7 @@ def test_a_message_that_cannot_be_folded_does_not_hold_up_the_others(
     kafka = FakeKafka([encode(m, "exact") for m in (good[0], replace(good[0], model="x"), good[1])])
     counts = ConsumerCounts()
 
-    async def opened() -> Broker:
-        return KafkaBroker(kafka)
-
-    asyncio.run(until(opened, Ingest(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 3))
+    asyncio.run(until(opening(kafka), Ingest(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 3))
     assert pipeline.state("north-1").used == 20
     assert (counts.messages, counts.refused) == (2, 1)
 
@@ -148,10 +149,7 @@ def test_a_message_that_fails_in_an_unforeseen_way_is_left_out_and_ends_no_consu
                 raise np.linalg.LinAlgError("singular matrix")
             return super().take(found)
 
-    async def opened() -> Broker:
-        return KafkaBroker(kafka)
-
-    asyncio.run(until(opened, Odd(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 3))
+    asyncio.run(until(opening(kafka), Odd(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 3))
     assert pipeline.state("north-1").used == 20
     assert (counts.messages, counts.refused) == (2, 1)
 
@@ -172,10 +170,9 @@ def test_an_acknowledgement_that_the_broker_does_not_take_ends_nothing(
     monkeypatch.setattr(kafka, "commit", fails_once)
     counts = ConsumerCounts()
 
-    async def opened() -> Broker:
-        return KafkaBroker(kafka, (ConnectionError,))
-
-    asyncio.run(until(opened, Ingest(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 4))
+    asyncio.run(
+        until(opening(kafka, (ConnectionError,)), Ingest(pipeline, 0.0, Clock()), counts, lambda: kafka.committed == 4)
+    )
     assert pipeline.state("north-1").used == 40
     assert counts.messages == 8
 
