@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.identification.fault_isolation.faults import fit_limit
+from sprung.model.identification.fault_isolation.explanation import fit_limit
 from sprung.model.identification.refinement.refine import Refined
 from sprung.model.identifier import without_values
 from sprung.model.signals import Deviating, Estimate, FloatArray

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,8 @@ from sprung.model.ambient.identify import AmbientIdentifier, OutputOnlyIdentifie
 from sprung.model.identification.amortised.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.estimates import EXCITED, estimates, not_identified
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.fault_isolation.faults import Explainer, FaultExplanation, fits
+from sprung.model.identification.fault_isolation.explainer import Explainer
+from sprung.model.identification.fault_isolation.explanation import FaultExplanation, fits, unexplained
 from sprung.model.identification.likelihood.linearise import PRIOR_STD, prior_std
 from sprung.model.identification.measurements.deviations import deviations
 from sprung.model.identification.model_uncertainty import ModelUncertainty, model_uncertainty
@@ -106,7 +107,7 @@ class Identifier:
         start: FloatArray | None = None,
     ) -> list[Estimate]:
         """As a tracker wants it: loads are refined along, the windows `weigh` (B,) say what they know of gains and
-        delays, and a wrong measurement is looked for where windows do not fit (`fault_isolation.faults`).
+        delays, and a wrong measurement is looked for where windows do not fit (`fault_isolation.explainer`).
 
         known: frozen, reversed and exchanged channels that earlier windows of the vehicle had, for each window: where
         a window has them again, nothing else is tried; and gains and delays, which are taken back first, so that what
@@ -152,14 +153,14 @@ class Identifier:
         explainer = self._explainer(windows.shape[1])
         moved = self._refiner(windows.shape[1]).model.excitation(windows) > EXCITED
         explained, contradicted = self._explained_beforehand(windows, known, explainer, moved)
-        plain = _left(np.arange(len(windows)), explained)
+        plain = unexplained(np.arange(len(windows)), explained)
         its_start = None if start is None else start[plain]
         found = self._plainly(windows[plain], weigh[plain], its_start, points[plain], moved[plain])
         asks = contradicted[plain] | np.array([e.informative and self._asks(e, explainer) for e in found], dtype=bool)
         explained |= explainer.explain(windows, plain[asks])
         whole = dict(zip(plain.tolist(), found, strict=True))
-        whole |= {b: self._restored(explainer.together(points[b], e)) for b, e in explained.items()}
-        for b in _left(plain, explained).tolist():
+        whole |= {b: self._restored(explainer.with_earlier(points[b], e)) for b, e in explained.items()}
+        for b in unexplained(plain, explained).tolist():
             if not whole[b].informative:
                 whole[b] = replace(whole[b], faults=explainer.stuck.all_inputs(windows[b]))
         for b in np.flatnonzero(np.isnan(windows).any(axis=(1, 2))).tolist():
@@ -177,9 +178,9 @@ class Identifier:
     ) -> tuple[dict[int, FaultExplanation], BoolArray]:
         """Windows, by index, with the faults that their vehicle had before or with redundant channels that contradict
         each other, put right; and which windows contain such a contradiction, (B,).  moved: by their inputs, (B,)."""
-        explained = explainer.again(windows, {b: its for b, its in enumerate(known) if its and moved[b]})
+        explained = explainer.from_known_faults(windows, {b: its for b, its in enumerate(known) if its and moved[b]})
         contradicted = moved & explainer.contradictions.contradicted(windows)
-        explained |= explainer.contradictory(windows, _left(np.flatnonzero(contradicted), explained))
+        explained |= explainer.from_contradictions(windows, unexplained(np.flatnonzero(contradicted), explained))
         return explained, contradicted
 
     def _as_far_as_looked_into(self, estimate: Estimate) -> Estimate:
@@ -414,11 +415,6 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
     std = np.sqrt(np.diagonal(refined.covariance, axis1=1, axis2=2))[:, : truth.shape[1]]
     found: FloatArray = np.minimum(np.median(std, axis=0), PRIOR_STD)
     return found
-
-
-def _left(of: IntArray, explained: Collection[int]) -> IntArray:
-    """Those of some windows that are not explained."""
-    return np.array([b for b in of.tolist() if b not in explained], dtype=np.int64)
 
 
 def _deviating(
