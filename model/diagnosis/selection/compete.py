@@ -182,7 +182,7 @@ def _converged_fits(problem: Problem, base: Fit, trials: list[Trial]) -> list[Tr
 
 def _with_unconverged_refitted(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     """Trials by evidence, after further iterations of unconverged fits that could still take the lead."""
-    exhausted: list[Fit] = []  # that further iterations did not improve
+    exhausted: list[Fit] = []  # whose further iterations gained less than they are behind: later ones gain less still
     for _ in range(problem.rules.selection.settling):
         best = trials[0].evidence
         unsettled = [
@@ -193,7 +193,11 @@ def _with_unconverged_refitted(problem: Problem, base: Fit, trials: list[Trial])
             break
         others = [t for t in trials if all(t is not one for one in falling)]
         again = _converged_fits(problem, base, falling)
-        exhausted += [new.fit for old, new in zip(falling, again, strict=True) if new.evidence <= old.evidence]
+        best = max(t.evidence for t in (*again, *others))
+        for old, new in zip(falling, again, strict=True):
+            gained = new.evidence - old.evidence
+            if gained <= max(0.0, best - new.evidence):
+                exhausted.append(new.fit)
         trials = by_evidence(problem, base, [*again, *others])
     return trials
 

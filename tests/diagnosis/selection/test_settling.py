@@ -1,4 +1,4 @@
-"""Fits that still fall are fitted on before the best of them leads; what got no further is not tried again."""
+"""Fits that still fall are fitted on before the best of them leads; what gets too little further is not tried again."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def trial(evidence: float, left: float) -> Trial:
     return Trial(nothing, fit, evidence, evidence, evidence, 1)
 
 
-@pytest.mark.parametrize(("step", "calls", "leading"), [(0.0, 1, 100.0), (30.0, 3, 150.0)])
+@pytest.mark.parametrize(("step", "calls", "leading"), [(0.0, 1, 100.0), (5.0, 1, 100.0), (30.0, 3, 150.0)])
 def test_what_could_lead_is_fitted_on_while_it_gets_further(
     monkeypatch: pytest.MonkeyPatch, step: float, calls: int, leading: float
 ) -> None:
