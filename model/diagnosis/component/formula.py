@@ -33,7 +33,7 @@ class FormulaPiece(Piece):
     parts: int = 0  # complexity
 
     @property
-    def plain(self) -> int:
+    def commoner(self) -> int:
         """Formulas compete with each other alone, by their `parts`."""
         return 0
 

@@ -62,7 +62,7 @@ def own_piece(law: ElementLaw, seen: Observed) -> Piece | None:
             values[strong] = zero + float(strengths[0]) / of_element(element)
         return tuple(values[i] for i in range(len(law.parameters)))
 
-    def believed(fitted: FittedPiece) -> bool:
+    def plausible(fitted: FittedPiece) -> bool:
         if not law.admits(tuple(fitted.values.values())):
             return False
         whole = float(fitted.strengths[0]) / of_element(fitted.element)
@@ -80,7 +80,7 @@ def own_piece(law: ElementLaw, seen: Observed) -> Piece | None:
         parameters=parameters,
         shape_of=lambda values: tuple(float(values[i]) for i in others),
         kind=HYSTERESIS if law.memory else STATIC,
-        believed=believed,
+        plausible=plausible,
     )
 
 

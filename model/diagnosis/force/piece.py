@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
@@ -92,27 +92,41 @@ FRICTION = PieceKind("friction", dissipates=True)
 HYSTERESIS = PieceKind("hysteresis", dissipates=True)
 
 Parameters = Callable[[FloatArray, Shape, SpringDamper], tuple[float, ...]]
-Believed = Callable[[FittedPiece], bool]
+Plausible = Callable[[FittedPiece], bool]
 Named = Callable[[FloatArray, Shape, SpringDamper], Values]
+
+
+def no_shapes(seen: MotionSizes) -> FloatArray:
+    """The grid of a piece without shapes: one trial of no values, (1, 0)."""
+    return np.zeros((1, 0))
+
+
+def no_limits(seen: MotionSizes) -> list[tuple[float, float]]:
+    """The limits of a piece without shapes."""
+    return []
 
 
 @dataclass(frozen=True)
 class Piece:
-    """One law as a piece of a component's force."""
+    """One law as a piece of a component's force.
+
+    Functions of it take `a`, the strengths, `s`, the shapes, `e`, the element, and `p`, the law's parameters.
+    """
 
     law: ElementLaw
-    shapes: tuple[str, ...]  # names of the nonlinear values
-    grid: Callable[[MotionSizes], FloatArray]  # trial shapes, (trials, shapes)
-    limits: Callable[[MotionSizes], list[tuple[float, float]]]  # of every shape
+    _: KW_ONLY
     signs: tuple[int, ...]  # of the strengths: 1, -1, 0 for either
     parameters: Parameters  # of the law, by strengths, shapes and element; linear in the strengths
-    shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # by the law's parameters
+    shapes: tuple[str, ...] = ()  # names of the nonlinear values
+    grid: Callable[[MotionSizes], FloatArray] = no_shapes  # trial shapes, (trials, shapes)
+    limits: Callable[[MotionSizes], list[tuple[float, float]]] = no_limits  # of every shape
+    shape_of: Callable[[Sequence[float]], tuple[float, ...]] = lambda p: ()  # by the law's parameters
     quoted: Named = lambda a, s, e: {}
     kind: PieceKind = STATIC  # look-alikes are mostly of one kind
-    rarer: int = 0  # than its law states, along a single motion: as `plain`
+    rarer: int = 0  # than its law states, along a single motion: as `commoner`
     acting: ElementLaw | None = None  # law of the columns, if not the named one
     acting_parameters: Parameters | None = None
-    believed: Believed = lambda fitted: True  # whether values are plausible for the record
+    plausible: Plausible = lambda fitted: True  # whether values are plausible for the record
     imitates: bool = False  # so flexible that it must leave as little as several laws
     at_low_rates: Piece | None = None  # what acts like it where it changes at low rates (`low_valve`)
     yields_with_rate: bool = False  # a yield force above a rate, with a steep slope below it
@@ -124,7 +138,7 @@ class Piece:
         return self.kind.dissipates
 
     @property
-    def plain(self) -> int:
+    def commoner(self) -> int:
         """Prior cost: number of commoner laws it contains or imitates, by the evidence that its law states to need."""
         return math.ceil(self.law.prior_cost / RARE) + self.rarer
 
@@ -209,13 +223,13 @@ class Following:
     def dissipates(self) -> bool:
         return self.piece.dissipates
 
-    def believed(self, fitted: FittedPiece) -> bool:
+    def plausible(self, fitted: FittedPiece) -> bool:
         """Whether the law's own values are plausible."""
-        return self.piece.believed(replace(fitted, shape=fitted.shape[: len(self.piece.shapes)]))
+        return self.piece.plausible(replace(fitted, shape=fitted.shape[: len(self.piece.shapes)]))
 
     @property
-    def plain(self) -> int:
-        return self.piece.plain + 1 + self.lagged
+    def commoner(self) -> int:
+        return self.piece.commoner + 1 + self.lagged
 
     @property
     def shapes(self) -> tuple[str, ...]:
@@ -300,8 +314,8 @@ class SliderSurface:
     key: str = UNKNOWN
     kind: PieceKind = STATIC
     dissipates: bool = False
-    believed: Believed = lambda fitted: True
-    plain: int = 0
+    plausible: Plausible = lambda fitted: True
+    commoner: int = 0
     shapes: tuple[str, ...] = ()
 
     @property
@@ -340,10 +354,10 @@ class Lag:
     title: str = SENSOR_LAG.title
     kind: PieceKind = STATIC
     dissipates: bool = False
-    believed: Believed = lambda fitted: (
+    plausible: Plausible = lambda fitted: (
         fitted.rules.late * fitted.step < abs(fitted.shape[0]) < fitted.rules.refined_latest * fitted.rules.latest
     )
-    plain: int = 0
+    commoner: int = 0
     shapes: tuple[str, ...] = ("time",)
     signs: tuple[int, ...] = ()
 
@@ -387,11 +401,6 @@ def admissible(law: ElementLaw, name: str) -> tuple[float, float]:
     """Limits of one of a law's parameters, as the law states them."""
     spec = next(one for one in law.parameters if one.name == name)
     return spec.low, spec.high
-
-
-def no_shapes(seen: MotionSizes) -> FloatArray:
-    """The grid of a piece without shapes."""
-    return np.zeros((1, 0))
 
 
 def rates_at(seen: MotionSizes, shares: Sequence[float]) -> FloatArray:

@@ -19,14 +19,14 @@ from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
 def _drift(law: ElementLaw, quantity: str) -> Piece:
     return Piece(
         law,
-        ("tau",),
-        lambda seen: grid(seen.seconds * np.array([0.1, 0.3, 1.0])),
-        lambda seen: [(0.03 * seen.seconds, 3.0 * seen.seconds)],
-        (0,),
-        lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300), s[0]),
-        lambda p: (p[1],),
+        shapes=("tau",),
+        grid=lambda seen: grid(seen.seconds * np.array([0.1, 0.3, 1.0])),
+        limits=lambda seen: [(0.03 * seen.seconds, 3.0 * seen.seconds)],
+        signs=(0,),
+        parameters=lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300), s[0]),
+        shape_of=lambda p: (p[1],),
         rarer=1,  # nearly every misfit along one short motion has a trend
-        believed=lambda fitted: fitted.shape[0] > fitted.rules.drift * fitted.seconds,
+        plausible=lambda fitted: fitted.shape[0] > fitted.rules.drift * fitted.seconds,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sprung.model.diagnosis.force.piece import Following, LawPiece, Piece, no_shapes
+from sprung.model.diagnosis.force.piece import Following, LawPiece, Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.laws.following import Covariate, following_law
 
@@ -13,12 +13,8 @@ def pieces_following(signal: Covariate) -> tuple[LawPiece, ...]:
     def linear(quantity: str) -> Piece:
         return Piece(
             following_law(quantity, signal),
-            (),
-            no_shapes,
-            lambda seen: [],
-            (0,),
-            lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300),),
-            lambda p: (),
+            signs=(0,),
+            parameters=lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300),),
         )
 
     return (

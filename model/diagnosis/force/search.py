@@ -107,7 +107,7 @@ def search(
     fine = task.every(max(1, len(task.force) // rules.fit))
     base = refined(quick, given)
     grown = _grown(base, pieces, tests, progress)
-    composite = {piece.key for piece in grown.current.fit.model.pieces[len(given.pieces) :] if piece.plain > 0}
+    composite = {piece.key for piece in grown.current.fit.model.pieces[len(given.pieces) :] if piece.commoner > 0}
     if composite:  # a law with many parameters may anticipate a sum of common ones
         progress(f"without {', '.join(sorted(composite))}")
         plainer = _grown(base, tuple(p for p in pieces if p.key not in composite), tests, progress)
@@ -158,7 +158,7 @@ def _plainer_of(one: _SelectedLaws, other: _SelectedLaws, rules: ComponentRules)
     alike = [
         g for g, fit in zip((one, other), fits, strict=True) if fit.held_out <= rules.as_well * best or fit.at_noise
     ]
-    return min(alike, key=lambda g: (sum(p.plain for p in g.current.fit.model.pieces), g.current.fit.model.count))
+    return min(alike, key=lambda g: (sum(p.commoner for p in g.current.fit.model.pieces), g.current.fit.model.count))
 
 
 def _beside(pieces: tuple[LawPiece, ...], model: ComponentModel, given: int) -> tuple[LawPiece, ...]:
@@ -181,7 +181,7 @@ def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules)
     for fit in fits:
         gain = level_gain(before.error, fit.error, count)
         cost = (fit.model.count - before.model.count) * float(np.log(count)) if count > 1 else 0.0
-        cost += rules.plain_cost * sum(piece.plain for piece in fit.model.pieces)
+        cost += rules.plain_cost * sum(piece.commoner for piece in fit.model.pieces)
         ranked.append(Ranked(fit, gain, gain - cost, count))
     return sorted(ranked, key=lambda r: -r.evidence)
 
@@ -241,7 +241,7 @@ def plausible(fit: ComponentFit, index: int = -1) -> bool:
     if len(strengths) and not np.any(np.abs(strengths) > 0):
         return False
     task = fit.task
-    return piece.believed(
+    return piece.plausible(
         FittedPiece(
             values={name: value for name, (value, _) in fit.values(index).items()},
             strengths=strengths,
@@ -364,7 +364,7 @@ def _plainest(near: list[Ranked], rules: ComponentRules) -> Ranked:
     """
     best = min(ranked.fit.held_out for ranked in near)
     alike = [ranked for ranked in near if ranked.fit.held_out <= rules.as_well * best or ranked.fit.at_noise]
-    return min(alike, key=lambda ranked: (ranked.last.plain, ranked.fit.model.count, ranked.fit.held_out))
+    return min(alike, key=lambda ranked: (ranked.last.commoner, ranked.fit.model.count, ranked.fit.held_out))
 
 
 def _leaves_nothing(lag: ComponentFit, before: ComponentFit, most: float) -> bool:

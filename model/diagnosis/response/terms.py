@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.diagnosis.response.structure import Branch, Structure
-from sprung.model.laws import BodyLaw, ElementLaw, Law, SensorLaw, SpringDamper, StructureLaw
+from sprung.model.laws import BodyLaw, ElementLaw, Law, Observed, SensorLaw, SpringDamper, StructureLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -97,6 +97,11 @@ class Term:
         if len(names) == 2:
             weights[system.elements.index(names[1])] = -1.0
         return weights
+
+
+def typical_scales(law: Law, motion: Observed) -> tuple[float, ...]:
+    """Typical sizes of a law's parameters along an element's motion; as `Term.scales`."""
+    return tuple(max(abs(spec.typical(motion)), 1e-12) for spec in law.parameters)
 
 
 def given_terms(system: System) -> tuple[Term, ...]:

@@ -13,7 +13,7 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import opened
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point, advance, fixed
-from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, evaluated_in_time
+from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, evaluated_in_time, typical_scales
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.laws import ElementLaw, Observed, SpringDamper, StructureLaw, observe
 from sprung.model.laws.base import FittedElement, Restart
@@ -173,7 +173,7 @@ def wider_starts(base: Fit, index: int) -> Iterator[Point]:
     if wider is None or wider.widened is None:
         return
     motion = seen(base, term)
-    scales = tuple(max(abs(spec.typical(motion)), 1e-12) for spec in wider.parameters)
+    scales = typical_scales(wider, motion)
     known: dict[str, float] = {}
     for other in base.point.terms:
         if other.location == term.location and other is not term:

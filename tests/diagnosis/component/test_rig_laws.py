@@ -61,15 +61,15 @@ def named(report: Report, effect: str) -> dict[str, float]:
     return {p.name: p.value for p in (*first.parameters, *first.quoted)}
 
 
-@pytest.mark.parametrize(("smoothing", "believed"), [(0.11, False), (0.01, True)])
-def test_friction_that_falls_has_been_above_what_it_falls_to(smoothing: float, believed: bool) -> None:
+@pytest.mark.parametrize(("smoothing", "plausible"), [(0.11, False), (0.01, True)])
+def test_friction_that_falls_has_been_above_what_it_falls_to(smoothing: float, plausible: bool) -> None:
     piece = next(piece for piece in PIECES if piece.effect == "stribeck")
     values = {"force": 128.0, "static_force": 205.0, "stribeck_rate": 0.13, "smoothing": smoothing}
     shape = (smoothing, 0.13)
     fit = FittedPiece(
         values, np.array([128.0, 77.0]), shape, SpringDamper(K, C), D, 1e-3, RULES.component, 1 / RATE, 20.0
     )
-    assert piece.believed(fit) is believed
+    assert piece.plausible(fit) is plausible
 
 
 def test_friction_whose_fall_is_not_identifiable_is_plain_friction_where_more_than_noise_is_left() -> None:

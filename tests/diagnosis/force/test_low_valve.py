@@ -36,7 +36,7 @@ def test_a_valve_that_opens_far_below_usual_rates_is_told_beside_friction(force:
     measured = 2e4 * D + force(V) + noise * np.random.default_rng(5).standard_normal(len(T))
     task = ComponentTask(element_motion(D, None, RATE), measured, int(0.7 * len(T)), noise=noise)
     assert task.seen.lowest_knee > 1.5 * KNEE  # no valve is searched there
-    pieces = tuple(p for p in PIECES if p.effect in ("damper_blowoff", "coulomb_friction") and p.plain == 0)
+    pieces = tuple(p for p in PIECES if p.effect in ("damper_blowoff", "coulomb_friction") and p.commoner == 0)
     found = search(task, pieces, lags=())
     alike = look_alikes(found.final, found.steps, 0)
     assert {step.piece.effect for step in found.steps} | {one.effect for one in alike} == told

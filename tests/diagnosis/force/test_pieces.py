@@ -68,7 +68,7 @@ def test_columns_times_strengths_are_the_force_of_the_acting_law(piece: Piece, m
 def test_a_piece_costs_what_its_law_needs_and_searches_no_further_than_its_law_admits(
     piece: Piece, motion: ElementMotion
 ) -> None:
-    assert piece.plain == piece.law.prior_cost / RARE + piece.rarer
+    assert piece.commoner == piece.law.prior_cost / RARE + piece.rarer
     stated = {spec.name: spec for spec in piece.law.parameters}
     for name, (low, high) in zip(piece.shapes, piece.limits(MotionSizes.of(motion)), strict=True):
         if name in stated:

@@ -17,7 +17,7 @@ from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.point import Point, advance
-from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time, typical_scales
 from sprung.model.diagnosis.rules import FormulaRules
 from sprung.model.diagnosis.screening.elements import TrialElement
 from sprung.model.diagnosis.screening.families import ELEMENT
@@ -145,7 +145,7 @@ class FormulaSearch:
 
     def _candidate(self, one: Scored) -> Candidate:
         law = law_of(one.parts)
-        scales = tuple(max(abs(spec.typical(self.motion.seen)), 1e-12) for spec in law.parameters)
+        scales = typical_scales(law, self.motion.seen)
         variant = " + ".join(form.text for form in one.parts)
         candidate = Candidate(Term(law, self.motion.location, one.values, variant, scales=scales), one.score, ELEMENT)
         return replace(candidate, start=self._start(one, candidate))

@@ -27,7 +27,7 @@ from sprung.model.diagnosis.investigation.search.widened import with_model
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation, Progress, share_done
 from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import WIDER, Term, evaluated_in_time
+from sprung.model.diagnosis.response.terms import WIDER, Term, evaluated_in_time, typical_scales
 from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.along_measured import ForceAlongMotion, MeasuredMotion, force_along_motion
@@ -61,9 +61,9 @@ def with_laws_along_motion(state: Investigation, progress: Progress) -> Investig
     if wrong:  # its force is close to the true one, which plausible laws have to make
         progress(share_done(0), f"the force of {place} along the simulated motion")
         fits += _sets_beside(state, place, closest, wrong)
-    believed = [fit for fit in fits if not _doubted(state, fit)]
-    best = min(believed, key=lambda fit: fit.chi_square, default=None)
-    return None if best is None else _accepted(state, best, believed)
+    plausible = [fit for fit in fits if not _doubted(state, fit)]
+    best = min(plausible, key=lambda fit: fit.chi_square, default=None)
+    return None if best is None else _accepted(state, best, plausible)
 
 
 def law_along_motion(state: Investigation) -> Candidate | None:
@@ -220,7 +220,7 @@ def _terms(fit: ComponentFit, place: str, along: ForceAlongMotion) -> Iterator[T
             continue
         law = piece.law
         values = law.clip([value for value, _ in fit.values(index).values()])
-        scales = tuple(max(abs(spec.typical(seen)), 1e-12) for spec in law.parameters)
+        scales = typical_scales(law, seen)
         yield Term(law, place, tuple(values.tolist()), "" if law.screened else WIDER, scales=scales)
 
 

@@ -52,7 +52,7 @@ _FITTED, _CHECKED = 0.5, 0.7  # of one finding's work
 class _Competition:
     """Fitted candidates of one step, sorted out."""
 
-    believed: list[Trial]  # all with plausible values, whether findings or not
+    plausible: list[Trial]  # all with plausible values, whether findings or not
     findings: list[Trial]  # of these, the ones whose evidence makes them findings
     leading: list[Trial]  # the findings in order of preference
     implausible: list[tuple[Trial, str]]  # of more evidence than any finding, with the reason for doubt
@@ -62,7 +62,7 @@ class _Competition:
         """This one, whose leading trial is the best of both if it has one, with the trials of another one behind it."""
         best = self.leading[0].evidence if self.leading else -np.inf
         return _Competition(
-            [*self.believed, *other.believed],
+            [*self.plausible, *other.plausible],
             [*self.findings, *other.findings],
             [*self.leading, *other.leading],
             [*self.implausible, *((trial, reason) for trial, reason in other.implausible if trial.evidence > best)],
@@ -116,7 +116,7 @@ def _with_leading(state: Investigation, competition: _Competition, progress: Cal
         state = calibrated(state, chosen.term)
         if state.calibrations:
             return state
-    second = runner_up(state.problem, state.fit, untried(state, state.last.candidates), chosen, competition.believed)
+    second = runner_up(state.problem, state.fit, untried(state, state.last.candidates), chosen, competition.plausible)
     p_value = _p_value(state, chosen)
     state, trial = _refitted(state, chosen, trials)
     rivals = tuple(t for t in trials if t is not trial)
@@ -157,16 +157,16 @@ def _competition(
     fitted = compete(state.problem, state.fit, candidates, progress, known)
     tried = with_wider_rivals(state, fitted)
     doubts = [(trial, doubt(trial.fit, trial.term, rules.plausible, before=state.fit)) for trial in tried]
-    believed = [trial for trial, reason in doubts if reason is None]
+    plausible = [trial for trial, reason in doubts if reason is None]
     present = [trial for trial in tried if trial.finished and not hardly_there(trial.fit, rules.plausible)]
     beyond = np.inf if instead is None else instead.evidence
     worthy = [t for t in present if t.evidence > 0 and (t.evidence > beyond or not is_minor(state, t))]
-    findings = [t for t in worthy if _contains(believed, t)]
+    findings = [t for t in worthy if _contains(plausible, t)]
     leading = preferred(findings, rules.selection)
     leading.sort(key=lambda t: t.candidate.family.rank)  # faults of the inputs first, of forces as of motions
     best = max((trial.evidence for trial in leading), default=-np.inf)
     implausible = [(t, reason) for t, reason in doubts if reason and t.evidence > best and _contains(worthy, t)]
-    return _Competition(believed, findings, leading, implausible, fitted)
+    return _Competition(plausible, findings, leading, implausible, fitted)
 
 
 def _beside_narrow(

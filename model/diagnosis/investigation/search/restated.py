@@ -19,7 +19,7 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.search.widened import with_model
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, Investigation
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
+from sprung.model.diagnosis.response.terms import Term, evaluated_in_time, typical_scales
 from sprung.model.diagnosis.selection.compete import Trial, cost
 from sprung.model.diagnosis.selection.evidence import profile_gain
 from sprung.model.diagnosis.selection.starts import seen
@@ -81,7 +81,7 @@ def _started(base: Fit, index: int, other: Restatement, theta: np.ndarray) -> Po
     port, grid = term.port(base.forward.system), base.forward.part.grid
     d, v = (motion @ port for motion in base.element_motion)
     motion = seen(base, term, other.element)
-    scales = tuple(max(abs(spec.typical(motion)), 1e-12) for spec in other.law.parameters)
+    scales = typical_scales(other.law, motion)
     replacement = Term(other.law, term.location, other.parameters, scales=scales)
     near = list(base.point.warm_start)
     place = sum(evaluated_in_time(one) for one in terms[:index])

@@ -108,7 +108,7 @@ def test_without_evidence_or_hardly_there_or_minor_nothing_is_a_finding(plain: d
     none, absent, minor = trial(evidence=-1.0), trial(evidence=20.0), trial(evidence=30.0)
     plain["trials"], plain["absent"], plain["minor"] = [none, absent, minor], (absent,), (minor,)
     found = compete(plain)
-    assert found.findings == found.leading == [] and found.believed == plain["trials"]
+    assert found.findings == found.leading == [] and found.plausible == plain["trials"]
     assert compete({**plain, "trials": []}).tried == []
 
 
