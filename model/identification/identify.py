@@ -215,8 +215,8 @@ class Identifier:
             pilots = rides[np.linspace(0, len(rides) - 1, PILOTS).astype(np.int64)]
             first, rides = refine(pilots, None, fully), np.setdiff1d(rides, pilots)
             good = fits(first)
-            near = np.median(first.log_ratio[good], axis=0) if good.any() else np.zeros(first.log_ratio.shape[1])
-            refine(rides, np.tile(near, (len(rides), 1)), fully)
+            median = np.median(first.log_ratio[good], axis=0) if good.any() else np.zeros(first.log_ratio.shape[1])
+            refine(rides, np.tile(median, (len(rides), 1)), fully)
         elif len(rides):
             refine(rides, None if start is None else start[rides], fully)
         refined = in_order([part for _, part in parts], np.concatenate([rows for rows, _ in parts]))

@@ -404,9 +404,9 @@ def _test_jumps(
     if best >= 0 and ratio[best] >= rules.evidence:
         direction = model.directions[best]
         kind = model.kind_along(direction)
-        told, by = (slope[best], curvature[best]) if bounded == 1.0 else (along[best], information[best])
+        score, by = (slope[best], curvature[best]) if bounded == 1.0 else (along[best], information[best])
         rivals = _rivals(model, ratio, slope / curvature, best)
-        jump = Jump(direction, float(told / by), float(by**-0.5), int(since[best]), kind, rivals)
+        jump = Jump(direction, float(score / by), float(by**-0.5), int(since[best]), kind, rivals)
         slope = curvature = trend = trend_curvature = np.zeros_like(slope)
     return (
         replace(

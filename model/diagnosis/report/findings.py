@@ -110,14 +110,14 @@ def _look_alikes(found: AcceptedFinding, rules: Rules) -> tuple[str | None, str 
     best = found.trial
     close = [t for t in found.trials if t.evidence > best.evidence - rules.report.naming_margin]
     close += found.implausible
-    near = [
+    equivalent = [
         t for t in close if t.named and t.term.location == best.term.location and t.term.law.name != best.term.law.name
     ]
     if best.term.law.listed:
-        near += unnamed_alike(found.trials, best, rules.report.naming_margin, rules.evidence)
-    if not near:
+        equivalent += unnamed_alike(found.trials, best, rules.report.naming_margin, rules.evidence)
+    if not equivalent:
         return None, None
-    names = " or ".join([best.term.law.name, *dict.fromkeys(t.term.law.name for t in near)])
+    names = " or ".join([best.term.law.name, *dict.fromkeys(t.term.law.name for t in equivalent)])
     return (
         names,
         f"{names} fit this recording almost equally well; {best.term.law.discriminated_by} would tell them apart",

@@ -92,10 +92,10 @@ class MeasuredMotion:
         both = {elements[element].upper: -1.0, elements[element].lower: 1.0}
         ends = {end: sign for end, sign in both.items() if end in bodies}
         others = {body: sum(body in (one.upper, one.lower) for one in elements.values()) for body in ends}
-        near = [body for body in ends if others[body] == min(others.values())]
+        fewest = [body for body in ends if others[body] == min(others.values())]
         unmeasured = grid.fine(part.force) + grid.fine_monomials @ part.force_polynomial
-        columns = {body: len(part.force[0]) - len(bodies) + bodies.index(body) for body in near}
-        missing = np.mean([ends[body] * unmeasured[:, columns[body]] for body in near], axis=0)
+        columns = {body: len(part.force[0]) - len(bodies) + bodies.index(body) for body in fewest}
+        missing = np.mean([ends[body] * unmeasured[:, columns[body]] for body in fewest], axis=0)
         own = force_along_motion(self.fit, element)
         return replace(own, force=own.force + missing[::OVERSAMPLING])
 

@@ -142,11 +142,11 @@ class HeldOut:
         state = np.zeros_like(point.state)
         trained = slice(0, self.split)
         weights = 1 / self.noise.sensors
-        near, rest = (point.warm_start if problem.process_noise else ()), np.zeros_like(state)
+        warm_start, rest = (point.warm_start if problem.process_noise else ()), np.zeros_like(state)
         for number in range(2 if problem.process_noise else _ROUNDS):
-            forward = problem.forward(replace(point, state=state, warm_start=near))
+            forward = problem.forward(replace(point, state=state, warm_start=warm_start))
             shown, forces, rest = self._free_run(problem, forward, state, rest, number)
-            near = warm_start_of(forces)
+            warm_start = warm_start_of(forces)
             rows = forward.free_rows_at_start()
             free = forward.plant.free_motion(rows, part.grid.step, self.split)
             particular = part.grid.inverse(shown)
@@ -160,7 +160,7 @@ class HeldOut:
                 break
         A = forward.plant.structure.state_matrix()
         simulated = particular + propagate(A, rows, state, part.grid.step, self.signals.samples)
-        return simulated[self.split :], replace(point, state=state, warm_start=near)
+        return simulated[self.split :], replace(point, state=state, warm_start=warm_start)
 
     def compare(self, before: Fit, after: Fit) -> HeldOutComparison:
         """Two fits on the held-out part.

@@ -47,10 +47,10 @@ def start_of(base: Fit, candidate: Candidate) -> Point:
         state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
     more = branches_of(candidate.term, base.forward.system, base.forward.plant.structure)
     state = np.pad(state, (0, len(more)))  # their forces
-    near = point.warm_start
+    warm_start = point.warm_start
     if evaluated_in_time(candidate.term):
-        near = (*near, base.force_along(candidate.term))
-    return Point(point.theta, (*point.terms, candidate.term), state, near)
+        warm_start = (*warm_start, base.force_along(candidate.term))
+    return Point(point.theta, (*point.terms, candidate.term), state, warm_start)
 
 
 def structure_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:

@@ -112,9 +112,9 @@ class LawAlongMotion:
         if self.law.memory:
             rates = np.stack([self._difference(self.law.memory_rate, motion, *pair) for pair in around])
             if rates.any():
-                near = _memory_step(memory)
+                step = _memory_step(memory)
                 force, rate = (
-                    self._slope(of, "z", near, motion, values, whole) for of in (self.law.force, self.law.memory_rate)
+                    self._slope(of, "z", step, motion, values, whole) for of in (self.law.force, self.law.memory_rate)
                 )
                 found += force * self._memory_sensitivity(rates, rate)
         return band_limited(found, self.parts)
@@ -128,7 +128,7 @@ class LawAlongMotion:
         self,
         function: Callable[..., Any],
         of: str,
-        near: FloatArray,
+        step: FloatArray,
         motion: Motion,
         p: Sequence[FloatArray],
         element: SpringDamper,
@@ -139,10 +139,10 @@ class LawAlongMotion:
             np.asarray(
                 function(
                     Motion(
-                        d + sign * near if of == "d" else d,
-                        v + sign * near if of == "v" else v,
+                        d + sign * step if of == "d" else d,
+                        v + sign * step if of == "v" else v,
                         time,
-                        memory + sign * near if of == "z" else memory,
+                        memory + sign * step if of == "z" else memory,
                     ),
                     p,
                     element,
@@ -150,7 +150,7 @@ class LawAlongMotion:
             )
             for sign in (1.0, -1.0)
         )
-        found = np.asarray((up - down) / (2 * near), dtype=np.float64)
+        found = np.asarray((up - down) / (2 * step), dtype=np.float64)
         return np.broadcast_to(found.reshape(found.shape[-2:]), self.d.shape)
 
     def _memory_sensitivity(self, rates: FloatArray, by_z: FloatArray) -> FloatArray:
@@ -165,14 +165,14 @@ class LawAlongMotion:
     def slopes(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> Slopes:
         """Derivatives by the motion; values and element (B, 1)."""
         law, memory = self.law, self.memory(p, element, first) if self.law.memory else np.zeros((0, *self.d.shape))
-        near = {"d": _SLOPE_STEP * self.size_d, "v": _SLOPE_STEP * self.size_v}
+        steps = {"d": _SLOPE_STEP * self.size_d, "v": _SLOPE_STEP * self.size_v}
         if law.memory:
-            near["z"] = _memory_step(memory)
+            steps["z"] = _memory_step(memory)
 
         motion = Motion(self.d, self.v, 0.0, memory)
 
         def slope(of: str, function: Callable[..., Any]) -> FloatArray:
-            return self._slope(function, of, near[of], motion, p, element)
+            return self._slope(function, of, steps[of], motion, p, element)
 
         by_d, by_v = (self._local_mean(slope(of, law.force)) for of in "dv")
         zero = np.zeros((len(self.d), self.samples - 1))
@@ -180,7 +180,7 @@ class LawAlongMotion:
             return Slopes(by_d, by_v, np.zeros_like(by_d), zero, zero, zero, zero, zero, zero[:, 0])
         by_z = self._local_mean(slope("z", law.force))
         carried = self._memory_transition(*(slope(of, law.memory_rate) for of in "zdv"))
-        return Slopes(by_d, by_v, by_z, *carried, near["z"][:, 0] / _SLOPE_STEP)
+        return Slopes(by_d, by_v, by_z, *carried, steps["z"][:, 0] / _SLOPE_STEP)
 
     def _local_mean(self, fine: FloatArray) -> FloatArray:
         """Local means (B, T) with triangular weights that reach to the neighbouring samples."""

@@ -68,8 +68,8 @@ def initial_iterate(w: LawWindows, start: Iterate, data: WindowBatch) -> Iterate
         gradient, information = by.shown @ w.residual(outputs, data, whiten), products
         if free_to_differ:
             slopes = w.slopes_along(along, point, steps)
-            near = slopes[0][..., free_to_differ], slopes[1][..., free_to_differ]
-            squares, pull = _errors(near, by, (point.force - law)[..., free_to_differ], (error * size) ** -1)
+            slopes_there = slopes[0][..., free_to_differ], slopes[1][..., free_to_differ]
+            squares, pull = _errors(slopes_there, by, (point.force - law)[..., free_to_differ], (error * size) ** -1)
             gradient, information = gradient - pull, products + squares
         factor, failed = torch.linalg.cholesky_ex(information)
         step = torch.cholesky_solve(gradient, factor).squeeze(2)

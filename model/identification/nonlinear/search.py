@@ -141,7 +141,7 @@ class LawSearch:
         w, data, smooth = self.windows, self.data.take(rows), self.smooth[:, rows.numpy()]
         point, before = self.point.take(rows), self.cost[rows]
         steps = w.steps(point, data)
-        point, motion, near = w.settle(point, steps, data)
+        point, motion, nearby_tangent = w.settle(point, steps, data)
         normal, tangent = w.normal_equations(point, steps, motion, data, smooth)
         residual = w.residual(motion.outputs, data, normal.whiten)
         cost, step, state_alone = normal.solve(residual, point.unknowns)
@@ -151,12 +151,12 @@ class LawSearch:
         dx0 = normal.state_step(state_alone, step)
         smooth = w.smoothed(normal, residual, step, dx0, steps)
         std = torch.diagonal(normal.covariance, dim1=1, dim2=2).sqrt()
-        second = self._second_step(normal, near, point.stepped(step, dx0), data)
+        second = self._second_step(normal, nearby_tangent, point.stepped(step, dx0), data)
         improved = second.squares <= squares * (1 + 1e-6) + _SLACK
         stationary = (step.abs() / std).amax(dim=1) < _STATIONARY
         going = (improved & ~stationary & ~worse & ~second.small(std)).nonzero().squeeze(1)
         if len(going):  # the normal equations are good enough for one more
-            self._third_step(going, second, normal.take(going), near.take(going), data.take(going))
+            self._third_step(going, second, normal.take(going), nearby_tangent.take(going), data.take(going))
         done = ((second.small(std) & improved) | stationary) & ~worse & cost.isfinite()
         done &= ~motion.diverged & ~second.motion.diverged
         _, diverged = torch.linalg.cholesky_ex(normal.covariance)  # not positive definite where the motion has diverged

@@ -172,8 +172,8 @@ class LawWindows:
             along = self.along(states, theirs, _DRIVES_AS_MEASURED, some, their_steps)
             if tangent is None:
                 tangent = self.tangent(along, some, their_steps).spread(moving, len(force))
-            near = tangent if everything else tangent.take(moving)
-            change = near.closed_loop(self.forces_along(along, some, their_steps) - some.force)
+            their_tangent = tangent if everything else tangent.take(moving)
+            change = their_tangent.closed_loop(self.forces_along(along, some, their_steps) - some.force)
             force[moving] += change
             moving = moving[self._immediate_effect(change, their_steps, theirs) >= _NEWTON_TOLERANCE]
         states, outputs = self.simulate(steps, force, point.x0, data)

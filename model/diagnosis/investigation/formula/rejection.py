@@ -29,8 +29,8 @@ def doubt_of(problem: Problem, trial: Trial, trials: Sequence[Trial]) -> str:
     if uncertainty(problem, trial.fit) > rules.agree * size:
         return "the values of the best formula leave its force uncertain"
     for rival in trials:
-        near = rival is not trial and rival.finished and rival.evidence > trial.evidence - rules.rival
-        if near and np.std(whole_force(trial.fit) - whole_force(rival.fit, trial.fit)) > rules.agree * size:
+        equivalent = rival is not trial and rival.finished and rival.evidence > trial.evidence - rules.rival
+        if equivalent and np.std(whole_force(trial.fit) - whole_force(rival.fit, trial.fit)) > rules.agree * size:
             own, other = trial.term.element_law.formula, rival.term.element_law.formula
             return f"{own} and {other} explain as much and differ in the range of the motion"
     if missing(problem, trial.fit) > rules.missing:

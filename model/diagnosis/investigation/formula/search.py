@@ -58,15 +58,15 @@ def _accepted(
     A formula with one value more that the recording does not determine, such as a * cos(d / L) instead of a * d**2, may
     lead by chance; it is no reason against the other.
     """
-    near: list[Trial] = []  # trials come by evidence
+    equivalent: list[Trial] = []  # trials come by evidence
     for trial in trials:
-        if near and trial.evidence <= near[0].evidence - problem.rules.report.naming_margin:
+        if equivalent and trial.evidence <= equivalent[0].evidence - problem.rules.report.naming_margin:
             break
         if _explains(problem, base, trial, unnamed, held):
-            near.append(trial)
-    near.sort(key=lambda trial: len(trial.term.parameters))  # stable: of equally many values by evidence
+            equivalent.append(trial)
+    equivalent.sort(key=lambda trial: len(trial.term.parameters))  # stable: of equally many values by evidence
     reason = ""
-    for trial in near:
+    for trial in equivalent:
         doubt = doubt_of(problem, trial, trials)
         if not doubt:
             return trial, ""

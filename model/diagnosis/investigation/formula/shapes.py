@@ -66,10 +66,10 @@ def without_last_term(problem: Problem, fit: Fit) -> Fit:
     residual = fit.residual + projector.seen_of(term.port(problem.system), spectrum)
     own = np.zeros(fit.jacobian.shape[1], dtype=bool)
     own[fit.place(len(point.terms) - 1)] = True
-    near = point.warm_start[: sum(evaluated_in_time(other) for other in point.terms[:-1])]
+    warm_start = point.warm_start[: sum(evaluated_in_time(other) for other in point.terms[:-1])]
     return replace(
         fit,
-        point=replace(point, terms=point.terms[:-1], warm_start=near),
+        point=replace(point, terms=point.terms[:-1], warm_start=warm_start),
         residual=residual,
         chi_square=float(residual @ residual),
         jacobian=fit.jacobian[:, ~own],

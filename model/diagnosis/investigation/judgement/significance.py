@@ -86,11 +86,11 @@ def _reported_covariance(state: Investigation) -> FloatArray:
 def _with_centred_gains(state: Investigation) -> Investigation:
     """The investigation with the gains of the inputs at the most likely common gain of all channels."""
     shared, spread = shared_gain(_instruments(state))
-    near = state.options.rules.fit.shared
-    if not state.calibrations or abs(np.log(shared)) <= near * spread:
+    limit = state.options.rules.fit.shared
+    if not state.calibrations or abs(np.log(shared)) <= limit * spread:
         return state
     fit = _scaled(state, 1 / shared)
-    return state if fit is None or fit.deviance > state.fit.deviance + 1 / near else replace(state, fit=fit)
+    return state if fit is None or fit.deviance > state.fit.deviance + 1 / limit else replace(state, fit=fit)
 
 
 def _scaled(state: Investigation, factor: float) -> Fit | None:

@@ -160,12 +160,12 @@ def _sets_of_laws(state: Investigation, place: str) -> list[Fit]:
     return [one for one in (fit, *(_simulated(state, start) for start in starts)) if one is not None]
 
 
-def _sets_beside(state: Investigation, place: str, near: Fit, wrong: set[str]) -> list[Fit]:
+def _sets_beside(state: Investigation, place: str, simulated: Fit, wrong: set[str]) -> list[Fit]:
     """A set of laws that makes the force of a simulated model without some of its laws, as simulated."""
-    force = force_along_motion(near, place)
+    force = force_along_motion(simulated, place)
     pieces = tuple(piece for piece in _pieces(state.problem.system) if piece.effect not in wrong)
-    found = search(_task(state, place, force, near), pieces, lags=())
-    fit = _simulated(state, _start(state, place, found.final, force, near)) if found.steps else None
+    found = search(_task(state, place, force, simulated), pieces, lags=())
+    fit = _simulated(state, _start(state, place, found.final, force, simulated)) if found.steps else None
     return [] if fit is None else [fit]
 
 
@@ -351,5 +351,5 @@ def _with_last(point: Point, index: int) -> Point:
     order = [*(i for i in range(len(point.terms)) if i != index), index]
     forces = iter(point.warm_start)
     of = [next(forces, None) if evaluated_in_time(term) else None for term in point.terms]
-    near = tuple(force for force in (of[i] for i in order) if force is not None)
-    return replace(point, terms=tuple(point.terms[i] for i in order), warm_start=near)
+    warm_start = tuple(force for force in (of[i] for i in order) if force is not None)
+    return replace(point, terms=tuple(point.terms[i] for i in order), warm_start=warm_start)

@@ -82,13 +82,13 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
     elif not candidates:
         return state
 
-    def told(text: str) -> None:
+    def report(text: str) -> None:
         progress(share_done(number), text)
 
-    competition = _competition(state, candidates, told)
+    competition = _competition(state, candidates, report)
     widened = wide is not None and is_better(state, wide, competition.leading)
     if wide is not None and widened:
-        beside = _beside_narrow(state, wide, candidates, told)
+        beside = _beside_narrow(state, wide, candidates, report)
         widened = is_better(state, wide, beside.leading)
         competition = beside.before(competition)
     tried = TriedTrials(state.fit, tuple(competition.tried))

@@ -83,12 +83,12 @@ def _started(base: Fit, index: int, other: Restatement, theta: np.ndarray) -> Po
     motion = seen(base, term, other.element)
     scales = typical_scales(other.law, motion)
     replacement = Term(other.law, term.location, other.parameters, scales=scales)
-    near = list(base.point.warm_start)
+    warm_start = list(base.point.warm_start)
     place = sum(evaluated_in_time(one) for one in terms[:index])
-    if place < len(near):
-        near[place] = force_along(other.law, other.parameters, d, v, grid.start + grid.fine_time, other.element)
+    if place < len(warm_start):
+        warm_start[place] = force_along(other.law, other.parameters, d, v, grid.start + grid.fine_time, other.element)
     terms = (*terms[:index], replacement, *terms[index + 1 :])
-    return replace(base.point, theta=theta, terms=terms, warm_start=tuple(near))
+    return replace(base.point, theta=theta, terms=terms, warm_start=tuple(warm_start))
 
 
 def _margin(state: Investigation, refitted: Fit, at: int) -> float:
