@@ -14,7 +14,7 @@ import numpy as np
 
 from sprung.model.identification.measurements.deviations import CARGO, OWN, Deviation, shared_directions
 from sprung.model.signals import BoolArray, FloatArray, IntArray
-from sprung.model.tracking.middle import median
+from sprung.model.tracking.median import median
 from sprung.model.tracking.rules import TRACKING_RULES, JumpRules
 
 GROUP_SHARE = 0.97  # of a delay's variance, common to the channels of one clock

@@ -22,7 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from sprung.model.signals import BoolArray, Conditions, FloatArray, IntArray
-from sprung.model.tracking.middle import median
+from sprung.model.tracking.median import median
 from sprung.model.tracking.rules import TRACKING_RULES, WeatherRules
 
 CONDITIONS = 3
