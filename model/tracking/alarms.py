@@ -23,7 +23,7 @@ from sprung.model.signals import FaultKind, FloatArray, IntArray, MeasurementFau
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.deviation_model import DeviationModel
-from sprung.model.tracking.deviations import Jump
+from sprung.model.tracking.jumps import Jump
 from sprung.model.tracking.rules import AlarmRules
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState

@@ -14,6 +14,7 @@ from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking.deviation_model import DeviationModel
+from sprung.model.tracking.deviation_record import DeviationRecord
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import TrackerState
 
@@ -53,7 +54,7 @@ class DeviationEffects:
         self,
         estimate: Estimate,
         found: Deviating | None,
-        calibration: dev.DeviationRecord,
+        calibration: DeviationRecord,
         belief: kalman.Belief,
         mask: BoolArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -84,13 +85,11 @@ class DeviationEffects:
         own = belief.covariance[-H:, -H:][at][:, at]
         return np.asarray(((cross[:, at] @ own) * cross[:, at]).sum(axis=1))
 
-    def unshared_variance(
-        self, calibration: dev.DeviationRecord, belief: kalman.Belief, cross: FloatArray
-    ) -> FloatArray:
+    def unshared_variance(self, calibration: DeviationRecord, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
         """Variance (P,) from deviations that are not the same in this window as in those of the baseline."""
         return self.variance(belief, cross, (calibration.moved > 0) | self.model.cargo)
 
-    def baseline_shift(self, state: TrackerState, calibration: dev.DeviationRecord, cross: FloatArray) -> FloatArray:
+    def baseline_shift(self, state: TrackerState, calibration: DeviationRecord, cross: FloatArray) -> FloatArray:
         """Contribution (P,) of the reference deviations to the baseline; loads are corrected window by window.
 
         A baseline is learned with gains and delays as the system file states them, and compared at the reference.
@@ -106,9 +105,9 @@ class DeviationEffects:
         self,
         state: TrackerState,
         tested: change_test.Changes,
-        calibration: dev.DeviationRecord,
+        calibration: DeviationRecord,
         cross: FloatArray,
-    ) -> dev.DeviationRecord:
+    ) -> DeviationRecord:
         """Record with the sensitivities of the baseline after a window."""
         if not self.model.size:
             return calibration

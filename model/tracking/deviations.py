@@ -1,138 +1,28 @@
-"""Update of gains, delays and loads by a window, and a sequential test for jumps of one of them.
+"""Update of gains, delays and loads by a window, and of the deviations under which the baseline was learned.
 
-Mean and covariance of the deviations are part of the filter's belief (levels, rates, deviations).  `DeviationRecord`
-holds the rest: mean sensitivities of the last windows, the deviations under which the baseline was learned, and the
-statistics of the test.  The test uses only the information on deviations that remains after the parameters are profiled
-out, so that a changed spring is not mistaken for a sensor fault.  H deviations, V directions (`deviation_model`).
+Mean and covariance of the deviations are part of the filter's belief (levels, rates, deviations); `DeviationRecord`
+holds the rest.  H deviations, V directions (`deviation_model`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import expit
 
-from sprung.model.signals import BoolArray, Deviating, FloatArray, IntArray
+from sprung.model.signals import BoolArray, Deviating, FloatArray
 from sprung.model.tracking.deviation_model import DeviationModel
+from sprung.model.tracking.deviation_record import LATELY, DeviationRecord
 from sprung.model.tracking.filter import Belief
+from sprung.model.tracking.jumps import Jump, reopen_jumped, tested_for_jumps
 
 MEMORY = 0.3  # weight of the newest window in the mean sensitivities
-LATELY = 100  # windows that are searched for a drift, which the reference of a baseline may have followed until then
-TREND_MOST = 2.0  # deviations of one of them at most: one window is no drift
 LINEARISATION_ERROR = 0.5  # of the square of a gain: error of a window that was linearised without correcting the gain
 CORRECTED_GAIN = 0.06  # gain from which windows are corrected before they are linearised
 UNLIKE_DATA_SHEET = 4.0  # times its tolerance: standard deviation of a gain (6 %), or a delay (8 ms), of a defect
 LIKELY_DEFECT = 1.0  # log-likelihood ratio of a defect; little is lost where there is none
 DEFECTIVE = 0.3  # of the channels at most: the others must tell what is right
-STOPPED = 5.0  # s without a used window after which passengers may have boarded
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DeviationRecord:
-    """State of the deviations that is not part of the filter's belief."""
-
-    cross: FloatArray  # mean sensitivity of the log-ratios to the deviations, shape (P, H)
-    base_cross: FloatArray  # the same over the windows of the baseline, shape (P, H)
-    reference: FloatArray  # deviations while the baseline was learned, shape (H,)
-    reference_variance: FloatArray  # of these, relative to the others of their group, shape (H,)
-    following: FloatArray  # share of a correction of the belief that belongs to the reference, too, shape (H,)
-    followed: FloatArray  # the belief that the reference has followed last, shape (H,)
-    lately: FloatArray  # how far the reference has followed over the last LATELY windows, shape (H,)
-    moved: FloatArray  # 1 where a deviation has jumped, or drifted away, since, shape (H,)
-    origin: FloatArray  # gains and delays when they were first known, shape (H,); NaN: not yet
-    slope: FloatArray  # recent evidence for a jump along each direction, shape (V,)
-    curvature: FloatArray  # its information, shape (V,)
-    trend: FloatArray  # evidence of the last windows, however weak, that a direction is followed late, shape (V,)
-    trend_curvature: FloatArray  # its information, shape (V,)
-    since: IntArray  # ns, when the evidence began to rise, shape (V,)
-    excess: FloatArray  # part of chi-square that known deviations explain, mean over windows, shape (1,)
-    recent: IntArray  # ns, the last windows with sensitivities of their own, shape (3,); 0: none
-
-    @property
-    def ratio(self) -> FloatArray:
-        """Log-likelihood ratio of a jump along each direction, shape (V,)."""
-        return np.asarray(self.slope**2 / (2 * np.maximum(self.curvature, 1e-12)))
-
-    def lag(self, model: DeviationModel) -> FloatArray:
-        """How far the last windows lie beyond what is believed, along each direction, shape (V,)."""
-        return np.asarray(self.trend / (self.trend_curvature + 1 / model.prior_along))
-
-
-def start(parameters: int, model: DeviationModel) -> DeviationRecord:
-    H, V = model.size, len(model.directions)
-    zeros = np.zeros
-    return DeviationRecord(
-        cross=zeros((parameters, H)),
-        base_cross=zeros((parameters, H)),
-        reference=zeros(H),
-        reference_variance=model.relative_variance(model.prior),
-        following=np.ones(H),
-        followed=zeros(H),
-        lately=zeros(H),
-        moved=zeros(H),
-        origin=np.full(H, np.nan),
-        slope=zeros(V),
-        curvature=zeros(V),
-        trend=zeros(V),
-        trend_curvature=zeros(V),
-        since=zeros(V, dtype=np.int64),
-        excess=zeros(1),
-        recent=zeros(3, dtype=np.int64),
-    )
-
-
-def extended(record: DeviationRecord, belief: Belief, model: DeviationModel) -> tuple[DeviationRecord, Belief]:
-    """An older state, extended by the model's deviations and directions that it does not have yet."""
-    old, H, V = belief.deviations, model.size, len(model.directions)
-    zeros = np.zeros(V)
-    if np.isnan(record.following).any():
-        record = _of_fixed_reference(record, model, belief)
-    if len(record.slope) != V:
-        record = replace(
-            record, slope=zeros, curvature=zeros, trend=zeros, trend_curvature=zeros, since=zeros.astype(np.int64)
-        )
-    if old >= H:
-        return record, belief
-    more, first = H - old, len(belief.mean)
-    covariance = np.zeros((first + more, first + more))
-    covariance[:first, :first] = belief.covariance
-    covariance[first:, first:] = model.prior[old:, old:]
-    wider = {name: np.pad(getattr(record, name), ((0, 0), (0, more))) for name in ("cross", "base_cross")}
-    fresh = start(len(record.cross), model)
-    longer = {
-        name: np.append(getattr(record, name), getattr(fresh, name)[old:])
-        for name in ("reference", "reference_variance", "following", "followed", "lately", "moved", "origin")
-    }
-    return (
-        replace(record, **wider, **longer),
-        Belief(np.pad(belief.mean, (0, more)), covariance, H),
-    )
-
-
-def _of_fixed_reference(record: DeviationRecord, model: DeviationModel, belief: Belief) -> DeviationRecord:
-    """An older state's record: its reference was the belief for ten minutes, up to a drift that was not seen."""
-    old = belief.deviations
-    unseen = np.where(np.isfinite(model.drift_limit), model.rules.drifted / 3 * model.drift_limit, 0.0)[:old] ** 2
-    zeros = np.zeros(old)
-    return replace(
-        record, reference_variance=unseen, following=zeros, followed=belief.mean[len(belief.mean) - old :], lately=zeros
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class Jump:
-    """A deviation that has jumped."""
-
-    direction: FloatArray  # shape (H,)
-    size: float
-    std: float
-    since: int  # ns
-    kind: str
-    rivals: tuple[FloatArray, ...] = ()  # other directions that explain the same windows about as well, each (H,)
-
-
-RIVALS = 2  # that are told of a jump
 
 
 def update(
@@ -154,10 +44,10 @@ def update(
     information = ((model.directions @ curvature) * model.directions).sum(axis=1).clip(1e-12)
     largest = float(np.max(np.abs(along) / np.sqrt(information), initial=0.0))
     bounded = min(1.0, model.rules.most / max(largest, 1e-12))
-    calibration, jump = _test_jumps(calibration, model, along, information, bounded, time)
+    calibration, jump = tested_for_jumps(calibration, model, along, information, bounded, time)
     agrees = bounded == 1.0 or jump is not None
     if jump is not None:
-        belief = _reopen_jumped(belief, model, calibration.cross, jump)
+        belief = reopen_jumped(belief, model, calibration.cross, jump)
         P = belief.covariance[-H:, -H:]
     elif bounded < 1.0:  # one window does not overturn the belief; several do, or a jump is found
         M, u = M * bounded**2, u * bounded**2
@@ -365,113 +255,6 @@ def level_variance(belief: Belief, model: DeviationModel, cross: FloatArray) -> 
     rows, cross = at + 2 * p, cross[:, at]
     with_levels, among = belief.covariance[:p, rows], belief.covariance[rows][:, rows]
     return np.asarray((variance + (cross * (cross @ among - 2 * with_levels)).sum(axis=1)).clip(1e-12))
-
-
-def update_loads(belief: Belief, model: DeviationModel, found: Deviating, share: float) -> Belief:
-    """Belief after a window with information on loads and constants of bodies only."""
-    at = model.refined_at
-    rows = at + len(belief.mean) - model.size
-    M = found.information[at][:, at] * share
-    u = found.score[at] * share - M @ (belief.mean[rows] - found.point[at])
-    across = belief.covariance[:, rows]
-    gain = np.linalg.solve(np.eye(len(at)) + M @ across[rows], np.column_stack([u, M]))
-    covariance = belief.covariance - across @ gain[:, 1:] @ across.T
-    return replace(belief, mean=belief.mean + across @ gain[:, 0], covariance=0.5 * (covariance + covariance.T))
-
-
-def _test_jumps(
-    calibration: DeviationRecord,
-    model: DeviationModel,
-    along: FloatArray,
-    information: FloatArray,
-    bounded: float,
-    time: int,
-) -> tuple[DeviationRecord, Jump | None]:
-    """Test statistics after a window whose scores are scaled by `bounded`, and a significant jump."""
-    # Directions without evidence restart: quiet windows before a jump must not outweigh it.
-    old, rules = calibration.slope, model.rules
-    lasting = old**2 > 2 * calibration.curvature * rules.restart
-    keep = np.where(lasting & (old * (rules.forgetting * old + along * bounded) > 0), rules.forgetting, 0.0)
-    slope = keep * old + along * bounded
-    curvature = keep * calibration.curvature + information
-    side = along * np.minimum(1.0, TREND_MOST * np.sqrt(information) / np.maximum(np.abs(along), 1e-300))
-    trend = (1 - 1 / LATELY) * calibration.trend + side
-    trend_curvature = (1 - 1 / LATELY) * calibration.trend_curvature + information
-    ratio = slope**2 / (2 * curvature)
-    since = np.where((ratio >= rules.onset) & (calibration.ratio < rules.onset), time, calibration.since)
-    best = int(np.argmax(ratio)) if len(ratio) else -1
-    jump = None
-    if best >= 0 and ratio[best] >= rules.evidence:
-        direction = model.directions[best]
-        kind = model.kind_along(direction)
-        score, by = (slope[best], curvature[best]) if bounded == 1.0 else (along[best], information[best])
-        rivals = _rivals(model, ratio, slope / curvature, best)
-        jump = Jump(direction, float(score / by), float(by**-0.5), int(since[best]), kind, rivals)
-        slope = curvature = trend = trend_curvature = np.zeros_like(slope)
-    return (
-        replace(
-            calibration, slope=slope, curvature=curvature, trend=trend, trend_curvature=trend_curvature, since=since
-        ),
-        jump,
-    )
-
-
-def _rivals(model: DeviationModel, ratio: FloatArray, size: FloatArray, best: int) -> tuple[FloatArray, ...]:
-    """Directions of other channels than the `best` one whose jump explains the windows about as well, best first.
-
-    ratio, size: of a jump along each direction, (V,).  Only differences between channels are determined: wheels of a
-    bogie that are late may look like sensors of that bogie that are early.
-    """
-    found = [model.directions[best]]
-    for v in np.argsort(-ratio).tolist():
-        if ratio[v] < ratio[best] - model.rules.rival or len(found) > RIVALS:
-            break
-        direction = model.directions[v]
-        kind = model.kind_along(direction)
-        apart = not any(np.any((direction != 0) & (other != 0)) for other in found)
-        if apart and kind in ("gain", "delay") and abs(size[v]) >= model.jump_limit(kind):
-            found.append(direction)
-    return tuple(found[1:])
-
-
-def _reopen_jumped(belief: Belief, model: DeviationModel, cross: FloatArray, jump: Jump) -> Belief:
-    """Belief after a jump: variance is added to the deviation, and to the parameters that had absorbed part of it."""
-    H = model.size
-    open_ = np.zeros(len(belief.mean))
-    open_[-H:] = 2 * jump.size * jump.direction
-    taken = np.zeros(len(belief.mean))
-    taken[: belief.size] = cross @ jump.direction * jump.size
-    return replace(belief, covariance=belief.covariance + np.outer(open_, open_) + np.outer(taken, taken))
-
-
-def reset_loads(
-    belief: Belief, model: DeviationModel, mean: FloatArray | None = None, variance: FloatArray | None = None
-) -> Belief:
-    """Belief after a stop: loads at their prior, or with masses of known `mean` and `variance` (L,)."""
-    covariance, state = belief.covariance.copy(), belief.mean.copy()
-    first = len(belief.mean) - model.size
-    at = model.cargo_at + first
-    covariance[at, :] = covariance[:, at] = 0.0
-    state[at], covariance[at, at] = 0.0, np.diag(model.prior)[model.cargo]
-    if mean is not None and variance is not None:
-        masses = model.loads_at + first
-        state[masses], covariance[masses, masses] = mean, variance
-    return replace(belief, mean=state, covariance=covariance)
-
-
-def loads_changed(belief: Belief, model: DeviationModel, found: Deviating) -> bool:
-    """Whether a window contradicts the believed loads: something was loaded or unloaded without a stop."""
-    at, along = model.cargo_at, model.refined_at
-    if not len(at):
-        return False
-    values, vectors = np.linalg.eigh(found.information[at][:, at])
-    observed = values > 1e-9 * max(float(values[-1]), 1e-300)
-    root = vectors[:, observed] / np.sqrt(values[observed])  # observable directions; constants of bodies as believed
-    rows = along + len(belief.mean) - model.size
-    M = root.T @ found.information[at][:, along]
-    seen = M @ (found.point[along] - belief.mean[rows]) + root.T @ found.score[at]
-    spread = np.eye(len(seen)) + M @ belief.covariance[rows][:, rows] @ M.T
-    return bool(seen @ np.linalg.solve(spread, seen) > model.rules.load**2)
 
 
 def reopen(belief: Belief, model: DeviationModel) -> Belief:

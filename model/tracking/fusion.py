@@ -16,12 +16,14 @@ from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import inflation, innovation
+from sprung.model.tracking import loads as loading
 from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.alarms import Drift
 from sprung.model.tracking.cargo import Cargo
 from sprung.model.tracking.deviation_effects import DeviationEffects
 from sprung.model.tracking.deviation_model import DeviationModel
-from sprung.model.tracking.deviations import Jump
+from sprung.model.tracking.deviation_record import DeviationRecord
+from sprung.model.tracking.jumps import Jump
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import TrackerState
 from sprung.model.tracking.weather import WeatherModel
@@ -125,15 +127,15 @@ class Fusion:
         predicted = kalman.predict(state.belief, elapsed, settings.process, settings.prior, self.model.walk, self.limit)
         return predicted, elapsed
 
-    def _faded(self, state: TrackerState, elapsed: float) -> dev.DeviationRecord:
+    def _faded(self, state: TrackerState, elapsed: float) -> DeviationRecord:
         """Record of the deviations `elapsed` seconds after the last window."""
         if not self.model.size or state.last is None:
             return state.calibration
         return dev.faded(state.calibration, self.model, state.belief, self.model.relative_walk * elapsed)
 
     def _followed(
-        self, state: TrackerState, calibration: dev.DeviationRecord, belief: kalman.Belief, *, settled: bool
-    ) -> dev.DeviationRecord:
+        self, state: TrackerState, calibration: DeviationRecord, belief: kalman.Belief, *, settled: bool
+    ) -> DeviationRecord:
         """Record whose reference has followed the belief after a window."""
         H = self.model.size
         if not H:
@@ -143,12 +145,12 @@ class Fusion:
 
     def _with_deviations(
         self,
-        calibration: dev.DeviationRecord,
+        calibration: DeviationRecord,
         belief: kalman.Belief,
         found: Deviating | None,
         time_ns: int,
         counts: tuple[float, float],
-    ) -> tuple[kalman.Belief, dev.DeviationRecord, Deviating | None, Jump | None, bool]:
+    ) -> tuple[kalman.Belief, DeviationRecord, Deviating | None, Jump | None, bool]:
         """Belief and record after a window's deviations; sensitivities in use, a jump, whether window and belief agree.
 
         counts: share of the window that is new, and its weight.
@@ -160,7 +162,7 @@ class Fusion:
             shift = self.effects.channel_shift(calibration.cross, belief, found.point)
             doubt = 1 + float((shift**4 / found.given.diagonal() ** 2).max()) / HARMLESS**4
             # its load was estimated with gains and delays as the system file states them
-            belief = dev.update_loads(belief, model, found, share * weight / doubt)
+            belief = loading.update(belief, model, found, share * weight / doubt)
             cross = np.where(model.refined, found.cross, calibration.cross)
             found = replace(found, cross=cross)
             return belief, calibration, found, None, True
@@ -170,7 +172,7 @@ class Fusion:
         return belief, calibration, found, jump, agrees
 
     def _filtered(
-        self, state: TrackerState, belief: kalman.Belief, calibration: dev.DeviationRecord, window: TrackedWindow
+        self, state: TrackerState, belief: kalman.Belief, calibration: DeviationRecord, window: TrackedWindow
     ) -> _Filtered:
         """The belief corrected by a window with inflated variance; levels that the filter has lost are reopened."""
         settings, effects, mask, value = self.settings, self.effects, window.mask, window.value
@@ -205,7 +207,7 @@ class Fusion:
     def _tested(
         self,
         state: TrackerState,
-        calibration: dev.DeviationRecord,
+        calibration: DeviationRecord,
         conditions: Conditions | None,
         window: TrackedWindow,
         filtered: _Filtered,
@@ -217,7 +219,7 @@ class Fusion:
         at = weathers.features(state.weather, conditions, self.load(belief))
         usable = mask & (state.changes.learned >= settings.learning)
         learning, elapsed = not self.armed(state), 0.0 if state.last is None else (window.time_ns - state.last) * 1e-9
-        departs = elapsed - settings.window > dev.STOPPED
+        departs = elapsed - settings.window > loading.STOPPED
         weather = weathers.ridden(state.weather, elapsed, learning=learning, departs=departs)
         weather = weathers.at_conditions(weather, self.weather, at, learning=learning)
         residual = np.where(usable, window.value - shift - np.where(usable, state.changes.baseline, 0.0), 0.0)
@@ -250,8 +252,8 @@ class Fusion:
         cargo = state.cargo
         if cargo is None or not len(self.model.loads_at):
             return False, state
-        rides = state.last is not None and elapsed - self.settings.window <= dev.STOPPED
-        contradicting = rides and found is not None and dev.loads_changed(belief, self.model, found)
+        rides = state.last is not None and elapsed - self.settings.window <= loading.STOPPED
+        contradicting = rides and found is not None and loading.contradicted(belief, self.model, found)
         cargo = cargos.disputed(cargo, time_ns, contradicting=contradicting)
         lasts = (time_ns - int(cargo.disputed[0])) * 1e-9 >= DISPUTED * self.settings.window
         return contradicting and not lasts, replace(state, cargo=cargo)
@@ -270,7 +272,7 @@ class Fusion:
         rows = model.loads_at + len(belief.mean) - model.size
         believed = belief.mean[rows], np.diag(belief.covariance)[rows]
         prior, pressure = np.diag(model.prior)[model.loads], _pressure(conditions, len(rows))
-        departs = elapsed - self.settings.window > dev.STOPPED
+        departs = elapsed - self.settings.window > loading.STOPPED
         changed = bool(cargo.disputed[0])
         contradicted = not (departs or changed) and cargos.contradicted(cargo, *believed, prior)
         if not (departs or changed or contradicted):
@@ -281,7 +283,7 @@ class Fusion:
             cargo = self._remembered(state, cargo, rows, state.last)
             cargo = cargos.after_ride(cargo, *believed) if departs else cargo
         cargo = cargos.before_ride(cargo, pressure, prior)
-        return dev.reset_loads(belief, model, cargo.prior, cargo.prior_variance), cargo
+        return loading.reset(belief, model, cargo.prior, cargo.prior_variance), cargo
 
     def _remembered(self, state: TrackerState, cargo: Cargo, rows: IntArray, last: int) -> Cargo:
         """The loads of a state, at `rows` of its belief, kept as those until its last window, ns."""
@@ -337,7 +339,7 @@ class Fusion:
         return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
 
 
-def _is_settled(state: TrackerState, calibration: dev.DeviationRecord, model: DeviationModel, now: int) -> bool:
+def _is_settled(state: TrackerState, calibration: DeviationRecord, model: DeviationModel, now: int) -> bool:
     """Whether no deviation is suspected to have jumped, nor has jumped a short time ago."""
     lately = any(a.kind == "sensor" and (now - a.opened) * 1e-9 < SETTLING for a in state.alarms)
     return not lately and calibration.ratio.max(initial=0.0) < model.rules.suspected

@@ -13,12 +13,12 @@ from typing import Any, Literal
 import numpy as np
 
 from sprung.model.signals import BoolArray, FaultKind, IntArray
-from sprung.model.tracking import deviations
+from sprung.model.tracking import deviation_record
 from sprung.model.tracking.cargo import Cargo
 from sprung.model.tracking.changes import Changes
 from sprung.model.tracking.coverage import Coverage
 from sprung.model.tracking.deviation_model import model_of
-from sprung.model.tracking.deviations import DeviationRecord
+from sprung.model.tracking.deviation_record import DeviationRecord
 from sprung.model.tracking.filter import Belief
 from sprung.model.tracking.inflation import VarianceInflation
 from sprung.model.tracking.innovation import InnovationCusum
@@ -220,10 +220,10 @@ def _innovation(data: Mapping[str, Any]) -> InnovationCusum:
 def _calibration(data: Mapping[str, Any]) -> DeviationRecord:
     """Format 1, and trackers without deviations, have none."""
     if "calibration" not in data:
-        return deviations.start(len(data["names"]), model_of(()))
+        return deviation_record.start(len(data["names"]), model_of(()))
     arrays = _unpack_all(data["calibration"])
     size, none = len(arrays["reference"]), np.zeros(len(arrays["slope"]))
-    unknown = np.full(size, np.nan)  # `deviations.extended` knows what older states leave open
+    unknown = np.full(size, np.nan)  # `deviation_record.extended` knows what older states leave open
     of_reference = ("origin", "reference_variance", "following", "followed", "lately")
     older: dict[str, Any] = {name: unknown for name in of_reference} | {"trend": none, "trend_curvature": none}
     shape = len(data["names"]), size

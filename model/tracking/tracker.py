@@ -15,14 +15,15 @@ from sprung.model.identification.measurements.deviations import OWN, Deviation, 
 from sprung.model.signals import BuiltOtherwise, Conditions, Estimate, FloatArray, IntArray, MeasurementFault
 from sprung.model.tracking import cargo as cargos
 from sprung.model.tracking import changes as change_test
-from sprung.model.tracking import coverage, inflation, innovation, misfit
+from sprung.model.tracking import coverage, deviation_record, inflation, innovation, misfit
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.alarms import Attribution, LoadLimit, counted
 from sprung.model.tracking.deviation_model import model_of as deviation_model
-from sprung.model.tracking.deviations import Jump
 from sprung.model.tracking.fusion import KNOWN, Fusion, nanoseconds
+from sprung.model.tracking.jumps import Jump
+from sprung.model.tracking.loads import STOPPED
 from sprung.model.tracking.reports import ParameterLike, ParameterReport, health_of, reported
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
 from sprung.model.tracking.state import Alarm, Health, Stuck, TrackerState, TrackerStateError
@@ -102,7 +103,7 @@ class Tracker:
             innovation=innovation.start(size),
             changes=change_test.start((size,)),
             fit=misfit.MisfitFloor(),
-            calibration=dev.start(size, self.model),
+            calibration=deviation_record.start(size, self.model),
             stuck=(),
             alarms=(),
             weather=weathers.start(self.weather),
@@ -197,7 +198,7 @@ class Tracker:
         """
         if state.belief.deviations > self.model.size:
             raise TrackerStateError("stored tracker state is of a version that followed more; start a new state")
-        calibration, belief = dev.extended(state.calibration, state.belief, self.model)
+        calibration, belief = deviation_record.extended(state.calibration, state.belief, self.model)
         if calibration is not state.calibration:
             state = replace(state, calibration=calibration, belief=belief)
         known = state.weather is not None and len(state.weather.common) == self.weather.groups
@@ -413,7 +414,7 @@ class Tracker:
         if state.last is None or state.time is None:
             return None
         idle = (state.time - state.last) * 1e-9 - self.settings.window
-        return state.last if idle > dev.STOPPED else None
+        return state.last if idle > STOPPED else None
 
 
 def _is_usable(estimate: Estimate) -> bool:

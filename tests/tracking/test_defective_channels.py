@@ -7,6 +7,7 @@ import pytest
 
 from sprung.model.identification.measurements.deviations import Deviation
 from sprung.model.signals import Deviating
+from sprung.model.tracking import deviation_record
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking.deviation_model import model_of
@@ -25,7 +26,7 @@ def followed(gain: float, seed: int, windows: int = 80) -> tuple[np.ndarray, np.
     A window tells a gain to 6 %, all of them together to half of a tolerance.
     """
     model, settings, rng = model_of(GAINS), TrackerSettings(), np.random.default_rng(seed)
-    record, belief = dev.start(1, model), kalman.prior(1, settings.prior, settings.process, model.prior)
+    record, belief = deviation_record.start(1, model), kalman.prior(1, settings.prior, settings.process, model.prior)
     information = (np.eye(CHANNELS) - 1 / CHANNELS) / 0.06**2
     truth = gain * (np.arange(CHANNELS) == 2) + 0.5 * SHEET * rng.standard_normal(CHANNELS) * (np.arange(CHANNELS) != 2)
     root = np.linalg.cholesky(information + 1e-9 * np.eye(CHANNELS))

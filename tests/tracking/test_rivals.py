@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sprung.model.identification.measurements.deviations import Deviation
-from sprung.model.tracking import deviations as dev
+from sprung.model.tracking import deviation_record, jumps
 from sprung.model.tracking.deviation_model import model_of
 from sprung.model.tracking.rules import TRACKING_RULES
 
@@ -17,9 +17,9 @@ DELAYS = [Deviation(f"c{i}", "delay", 0.002, group) for i, group in enumerate((0
 def jump_of(information: np.ndarray, late: np.ndarray) -> tuple[set[str], list[set[str]]]:
     """Channels of the jump that windows with this information (H, H) show, and those of its rivals."""
     model = model_of(DELAYS)
-    record = dev.start(3, model)
+    record = deviation_record.start(3, model)
     slope, curvature = information @ late, np.einsum("vh,hk,vk->v", model.directions, information, model.directions)
-    record, jump = dev._test_jumps(record, model, model.directions @ slope, curvature, 1.0, 0)
+    record, jump = jumps.tested_for_jumps(record, model, model.directions @ slope, curvature, 1.0, 0)
     assert jump is not None
     return _names(jump.direction), [_names(rival) for rival in jump.rivals]
 
@@ -50,6 +50,6 @@ def test_a_rival_is_told_up_to_the_stated_ratio_only() -> None:
     model = model_of(DELAYS)
     ratio, size = np.zeros(len(model.directions)), np.full(len(model.directions), 1e-3)
     ratio[:3] = 30.0, 30.0 - 0.9 * TRACKING_RULES.jumps.rival, 30.0 - 1.1 * TRACKING_RULES.jumps.rival
-    assert [_names(one) for one in dev._rivals(model, ratio, size, 0)] == [{"c1"}]
+    assert [_names(one) for one in jumps.rivals(model, ratio, size, 0)] == [{"c1"}]
     size[1] = 0.5 * TRACKING_RULES.jumps.delay
-    assert dev._rivals(model, ratio, size, 0) == ()
+    assert jumps.rivals(model, ratio, size, 0) == ()

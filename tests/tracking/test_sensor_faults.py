@@ -10,7 +10,7 @@ import pytest
 
 from sprung.model.identification.measurements.deviations import Deviation
 from sprung.model.signals import Deviating, Estimate, FloatArray, MeasurementFault
-from sprung.model.tracking import deviations as dev
+from sprung.model.tracking import jumps
 from sprung.model.tracking.deviation_model import model_of
 from sprung.model.tracking.rules import TRACKING_RULES
 from sprung.model.tracking.state import Stuck
@@ -233,10 +233,10 @@ def test_one_window_that_shows_the_other_way_does_not_end_the_evidence_for_a_jum
         state = tracker.update(state, gained(rng, np.zeros(6)), EPOCH + k * SECOND)
     record = replace(state.calibration, slope=np.full(6, 3e4), curvature=np.full(6, 1e8))  # 3 deviations
     along, information = np.full(6, -1e3), np.full(6, 1e7)
-    after, jump = dev._test_jumps(record, tracker.model, along, information, 1.0, EPOCH)
+    after, jump = jumps.tested_for_jumps(record, tracker.model, along, information, 1.0, EPOCH)
     assert jump is None
     np.testing.assert_allclose(after.slope, TRACKING_RULES.jumps.forgetting * 3e4 - 1e3)
-    turned, _ = dev._test_jumps(record, tracker.model, np.full(6, -3e4), 10 * information, 1.0, EPOCH)
+    turned, _ = jumps.tested_for_jumps(record, tracker.model, np.full(6, -3e4), 10 * information, 1.0, EPOCH)
     np.testing.assert_allclose(turned.slope, -3e4)  # begins anew
 
 
