@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sprung.benchmarks.paper_report.comparisons import FIGURES, compare, compare_by_seed
+from sprung.benchmarks.paper_report.document import of_several_arithmetics
 from sprung.benchmarks.paper_report.kept import opened
 from sprung.benchmarks.paper_sources import MADE_BY
 from sprung.service.errors import UserError
@@ -34,6 +35,7 @@ def run(
         raise UserError(f"bench paper-compare: no task {task!r}; known are {', '.join(MADE_BY)}")
     with opened(kept) if data is None else nullcontext(data) as folder:
         for method in methods.split(","):
+            _check_arithmetic(folder, task, (method, over))
             found = _by_trajectory(folder, task, method, over) if figure is None else []
             if figure is not None:
                 found = _by_seed(folder, task, method, over, figure)
@@ -60,8 +62,7 @@ def _by_trajectory(folder: Path, task: str, method: str, over: str) -> list[dict
 
 
 def _by_seed(folder: Path, task: str, method: str, over: str, figure: str) -> list[dict[str, Any]]:
-    rows = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob(f"{task}-*.json"))]
-    found = compare_by_seed(rows, task, method, over, figure)
+    found = compare_by_seed(_rows(folder, task), task, method, over, figure)
     if found is None:
         return []
     return [
@@ -72,6 +73,20 @@ def _by_seed(folder: Path, task: str, method: str, over: str, figure: str) -> li
             "p_seeds": None if found.p_seeds is None else _rounded(found.p_seeds),
         }
     ]  # fmt: skip
+
+
+def _rows(folder: Path, task: str) -> list[dict[str, Any]]:
+    return [json.loads(path.read_text()) for path in sorted((folder / "rows").glob(f"{task}-*.json"))]
+
+
+def _check_arithmetic(folder: Path, task: str, methods: tuple[str, str]) -> None:
+    """Raise UserError where both methods have a row of one seed, and these differ in arithmetic."""
+    rows = [row for row in _rows(folder, task) if row["task"] == task and row.get("method") in methods]
+    if mixed := of_several_arithmetics(rows):
+        raise UserError(
+            f"bench paper-compare: {folder}: {' and '.join(methods)} were made with different arithmetic:"
+            f" {', '.join(mixed)}"
+        )
 
 
 def _rounded(value: float) -> float:

@@ -99,11 +99,11 @@ def comparisons_of_tasks(rows: Rows, tasks: Sequence[str], method: str, over: st
     return _table_by_seed("task", f"{method} over {over}, {figure}", compared)
 
 
-def comparisons_of_names(rows: Rows, task: str, pairs: dict[str, tuple[str, str]], figure: str) -> str | None:
-    """The same within one task, a line for each pair of methods by its name; pairs without rows are left out."""
-    found = {name: compare_by_seed(rows, task, *pair, figure) for name, pair in pairs.items()}
+def comparisons_of_names(rows: Rows, task: str, pairs: dict[str, tuple[str, str, str]]) -> str | None:
+    """The same within one task, a line by name for each method, the other and a figure; those without rows left out."""
+    found = {name: compare_by_seed(rows, task, *pair) for name, pair in pairs.items()}
     compared = {name: one for name, one in found.items() if one is not None}
-    return _table_by_seed("case", f"{figure}, ratio", compared) if compared else None
+    return _table_by_seed("case", "ratio", compared) if compared else None
 
 
 def _table_by_seed(first: str, what: str, compared: dict[str, SeedComparison]) -> str:

@@ -27,7 +27,18 @@ from sprung.benchmarks.paper_sources import is_current
 
 PLACE = re.compile(r"<!-- (?P<kind>\w+)(?: (?P<task>\w+))? -->(?P<before>.*?)<!-- end -->", re.DOTALL)
 VISUAL = ("pendulum", "mass_spring_damper", "two_body")
-VARIANTS = ("alps", *EXTRA)  # beside ALPS: as printed, a departure left out, newer methods
+ABLATIONS = ("no_fourier", "no_attention")
+VARIANTS = ("alps", *ABLATIONS, *EXTRA)  # beside ALPS: the paper's ablations, as printed, a departure left out, others
+COMPARED: dict[str, tuple[tuple[str, str, str], ...]] = {  # method, over which, figure
+    "train": (
+        ("cdm", "alps", "SE_relative"), ("no_fourier", "alps", "SE_relative"), ("no_fourier", "alps", "PE_relative"),
+        ("alps_smoothed", "alps", "SE_relative"), ("alps_smoothed", "alps", "PE_relative"),
+    ),
+    "train_changing": (
+        ("alps", "guess_nominal", "PE_relative"), ("alps_many", "guess_nominal", "PE_relative"),
+        ("refined", "guess_nominal", "PE_relative"),
+    ),
+}  # fmt: skip
 Rows = list[dict[str, Any]]
 
 
@@ -52,13 +63,26 @@ def _stale(rows: Rows) -> list[str]:
     return sorted({f"{row['task']} {name_of(row)}" for row in rows if not is_current(row)})
 
 
+def of_several_arithmetics(rows: Rows) -> list[str]:
+    """Task and seed of rows that were not all made with the same arithmetic: these may not be held against each other.
+
+    Training carries the last bit far, and another processor's sums differ in it.
+    """
+    found: dict[tuple[str, int], set[str]] = {}
+    for row in rows:
+        found.setdefault((row["task"], int(row.get("seed") or 0)), set()).add(str(row.get("arithmetic", "")))
+    return [f"{task} seed {seed}" for (task, seed), names in sorted(found.items()) if len(names) > 1]
+
+
 def refresh(folder: Path, document: Path, only: list[str] | None = None) -> list[dict[str, Any]]:
     """Write the document's places and its pictures, or `only` places of these kinds or markers.
 
     Places of tasks with rows of other code stay as they stand, and are told with these rows.  Errors: `ValueError`
-    where no task is left.
+    where no task is left, or where rows of one seed have different arithmetic.
     """
     found = _all_rows(folder)
+    if mixed := of_several_arithmetics(found):
+        raise ValueError(f"{folder}: rows of one seed with different arithmetic: {', '.join(mixed)}; run them again")
     of_other_code = {task: _stale([row for row in found if row["task"] == task]) for task in {r["task"] for r in found}}
     found = [row for row in found if not of_other_code[row["task"]]]
     if not found:
@@ -123,8 +147,15 @@ def _poor_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     """Classical identification over ALPS where both start from an opening that is wrong."""
     del folder
     names = sorted({name_of(row).rpartition(" ")[0] for row in rows})
-    pairs = {f"{name}, output_error over alps": (f"{name} output_error", f"{name} alps") for name in names}
-    return comparisons_of_names(rows, task, pairs, "PE") or before.strip("\n")
+    pairs = {f"{name}, output_error over alps, PE": (f"{name} output_error", f"{name} alps", "PE") for name in names}
+    return comparisons_of_names(rows, task, pairs) or before.strip("\n")
+
+
+def _compared_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    """Methods of the train against each other: their errors by trajectory are not kept, so that seeds are compared."""
+    del folder
+    pairs = {f"{method} over {over}, {figure}": (method, over, figure) for method, over, figure in COMPARED[task]}
+    return comparisons_of_names(rows, task, pairs) or before.strip("\n")
 
 
 def _targets_place(task: str, rows: Rows, folder: Path, before: str) -> str:
@@ -155,6 +186,7 @@ KINDS: dict[str, Callable[[str, Rows, Path, str], str]] = {
     "printed": _printed_place,
     "noisy": _noisy_place,
     "poor": _poor_place,
+    "compared": _compared_place,
     "targets": _targets_place,
     "variants": _variants_place,
     "full": _full_place,

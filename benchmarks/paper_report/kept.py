@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from sprung.benchmarks.paper_report.document import read_rows
+from sprung.benchmarks.paper_report.document import of_several_arithmetics, read_rows
 from sprung.benchmarks.paper_report.tables import name_of
 from sprung.benchmarks.paper_settings import row_name
 from sprung.service.errors import UserError
@@ -74,6 +74,12 @@ def run(
         if errors.is_file():
             files[f"{kept}/errors/{name}.npz"] = _single(errors)
         told.setdefault((row["task"], name_of(row)), []).append(row.get("seed", 0))
+    together = [json.loads(text) for name, text in files.items() if name.startswith(f"{kept}/rows/")]
+    if mixed := of_several_arithmetics(together):
+        raise UserError(
+            f"bench paper-keep: {data}: {', '.join(mixed)}: the set {kept!r} would hold rows of different arithmetic,"
+            " which may not be compared; nothing was kept"
+        )
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
         for name in sorted(files):
             file.writestr(zipfile.ZipInfo(name), files[name], zipfile.ZIP_DEFLATED)

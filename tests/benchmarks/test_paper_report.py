@@ -179,6 +179,36 @@ def test_tables_say_which_seeds_have_other_arithmetic(tmp_path: Path) -> None:
     assert {cell.seeds for cell in rerun_paper.stated(document.read_text())} == {(0, 1, 2)}
 
 
+def test_rows_of_one_seed_with_different_arithmetic_are_not_held_against_each_other(tmp_path: Path) -> None:
+    for method, arithmetic in (("alps", "AVX512"), ("cdm", "AVX2"), ("zero", "AVX512")):
+        keep(tmp_path, method, 0, SE=1.0, PE=1.0, arithmetic=arithmetic)
+        keep_errors(tmp_path, method, 0, SE=np.ones(9))
+    page, archive = tmp_path / "paper.md", tmp_path / "rows.zip"
+    page.write_text(PAGE)
+    with pytest.raises(UserError, match="different arithmetic: pendulum seed 0"):
+        list(paper_report.run(tmp_path, page))
+    assert page.read_text() == PAGE
+    for figure in (None, "SE"):
+        with pytest.raises(UserError, match="cdm and alps were made with different arithmetic: pendulum seed 0"):
+            list(compare.run("pendulum", "cdm", figure=figure, data=tmp_path))
+        assert list(compare.run("pendulum", "zero", figure=figure, data=tmp_path))
+    list(kept.run("core", tmp_path, methods="alps,zero", archive=archive))
+    before = archive.read_bytes()
+    with pytest.raises(UserError, match="pendulum seed 0: the set 'core' would hold rows of different arithmetic"):
+        list(kept.run("core", tmp_path, methods="cdm", archive=archive))
+    assert archive.read_bytes() == before
+
+
+def test_methods_of_the_train_are_held_against_each_other_by_seed(tmp_path: Path) -> None:
+    for seed in range(3):
+        for method, error in (("alps", 0.01), ("cdm", 0.2 + 0.01 * seed)):
+            keep(tmp_path, method, seed, task="train", SE_relative=error, sources=sources("train"))
+    page = tmp_path / "paper.md"
+    page.write_text("<!-- compared train -->\n<!-- end -->\n")
+    list(paper_report.run(tmp_path, page))
+    assert "| cdm over alps, SE_relative | 21 | 20, 21, 22 | 8.2e-05 |" in page.read_text()
+
+
 def test_any_figure_of_the_rows_is_compared_by_seed(tmp_path: Path) -> None:
     for seed in range(3):
         keep(tmp_path, "alps", seed, PE_noisy=0.02 * (seed + 1))
