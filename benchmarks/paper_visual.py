@@ -1,7 +1,7 @@
 """Rows of Fig. 4: pendulum, double mass-spring-damper, two-body system; SE, OE, PE and what they leave open.
 
 Beside the paper's five methods: answers without training, the methods as printed, each departure left out, and two
-methods that came after the paper (`model.alps.config.RECIPES`).
+methods that are not the paper's (`model.alps.config.RECIPES`).
 """
 
 from __future__ import annotations

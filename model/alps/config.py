@@ -59,7 +59,7 @@ RECIPES: dict[str, Recipe] = {
     "no_falling_prior": Recipe(falling_prior=False),
     "scales_halved": Recipe(scale=0.5),
     "scales_doubled": Recipe(scale=2.0),
-    # since the paper
+    # with other physics: an energy that is learned (before the paper), the equations without pictures (after it)
     "hamiltonian": Recipe(dynamics="hamiltonian"),
     "decoder_free": Recipe(attention=False, drawn=False),
 }
