@@ -188,6 +188,9 @@ class SelectionRules:
     )
     together: float = rule(0.5, "of the work of a search, on top of it, for that; chosen", 0.3, 1.0)
     alike: float = rule(2.0, "of the error in a force, up to which another set of laws is simulated; chosen", 1.5, 4.0)
+    fine: float = rule(
+        0.02, "of the misfit, that a set of plausible laws may leave so that no other is simulated; chosen", 0.005, 0.05
+    )
     last: int = rule(4, "that are fitted to the end if they fall fast; chosen", 2, 6)
     finished: int = rule(6, "that are fitted to the end when they are close; chosen", 4, 9)
     settling: int = rule(3, "rounds in which fits that still fall and could lead are fitted on; chosen", 1, 6)

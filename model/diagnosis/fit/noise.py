@@ -22,7 +22,7 @@ from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.rules import NoiseRules
 from sprung.model.signals import FloatArray
 
-_ROUNDS = 4
+_ROUNDS = 4  # of levels and the weights that follow from them
 
 
 def input_noise(part: Part, noise: Noise) -> Noise:

@@ -20,7 +20,7 @@ from sprung.model.laws.spline import SurfaceLaw
 from sprung.model.signals import FloatArray
 
 _MOST = 4000  # samples of a scatter
-_BINS = 41
+_BINS = 41  # of a force map along deflection and rate
 
 
 def plot_data_of(

@@ -24,9 +24,9 @@ from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
 TOLERANCE = 1e-6  # relative, of the laws' forces
-_ITERATIONS = 60
+_ITERATIONS = 60  # of the laws' forces at most
 _PATIENCE, _PROGRESS = 16, 0.5  # abandoned if the error has not fallen by this factor in as many iterations
-_HISTORY = 8
+_HISTORY = 8  # iterates that Anderson acceleration combines
 _REACH = 4.0  # times the linear response's amplitude, to which diverging iterates are clipped
 
 

@@ -23,7 +23,7 @@ from sprung.model.laws import CLOCK_LEAD, Law, SupportLaw
 from sprung.model.signals import FloatArray
 
 _FINER = 8  # frequencies per bin: the last harmonic drifts by half a turn at most over the recording
-_PHASES = 64
+_PHASES = 64  # trial phases of a period
 
 
 def harmonic_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:

@@ -25,7 +25,7 @@ from sprung.model.diagnosis.screening.families import ELEMENT, Family
 from sprung.model.signals import FloatArray
 
 MEDIAN_OF_CHI_SQUARE = 1.386  # with two degrees of freedom
-_ROUNDING = 1e-7
+_ROUNDING = 1e-7  # share of a squared column that the projection leaves of one that the Jacobian contains
 
 
 @dataclass(frozen=True)

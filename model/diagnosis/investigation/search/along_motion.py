@@ -39,7 +39,6 @@ from sprung.model.laws.along import force_along
 from sprung.model.system import System
 
 _STEPS, _ROUNDS = 12, 3  # of the simulation of all laws, and how often it goes on
-_FINE = 0.02  # of the misfit, up to which the first plausible set is taken
 _LEAST = 1e-3  # of nominal, of a spring or damper that a force seems not to have
 _TURNED = 2  # of the same model with its laws in another order
 
@@ -143,14 +142,15 @@ def _sets_of_laws(state: Investigation, place: str) -> list[Fit]:
     if measured is None:
         return []
     (along, force, task), pieces = measured, _pieces(state.problem.system)
+    rules = state.options.rules.selection
     first = search(task, pieces, lags=())
     names = dict.fromkeys(piece.effect for piece in first.final.model.pieces)
     if len(names) < 2:
         return []
     fit = _simulated(state, _start(state, place, first.final, force, along))
-    if fit is not None and fit.chi_square < _FINE * state.fit.chi_square and not _doubted(state, fit):
+    if fit is not None and fit.chi_square < rules.fine * state.fit.chi_square and not _doubted(state, fit):
         return [fit]
-    most = state.options.rules.selection.alike * first.final.error
+    most = rules.alike * first.final.error
     others = (search(task, tuple(p for p in pieces if p.effect != name), lags=()) for name in names)
     starts = [
         _start(state, place, other.final, force, along)
