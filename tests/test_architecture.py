@@ -113,6 +113,7 @@ PACKAGES = {
         "fault_isolation",
         "amortised",
         "estimates",
+        "window_deviations",
         "model_uncertainty",
         "identify",
     ),
