@@ -46,7 +46,7 @@ class VehicleLife:
 
     days: float
     rides: int
-    unused: int  # rides that told the tracker nothing, or while windows were said not to fit
+    unused: int  # rides without information for the tracker, or while windows were said not to fit
     strangers: list[str]  # alarms of changes and misfits that are none
     sensors: int  # alarms of kind sensor
     found_after: float | None  # s of calendar from the fault to its alarm
@@ -91,7 +91,7 @@ def pool(some: Sequence[Estimate], prior: FloatArray) -> Pool:
     precision = [np.linalg.inv(of.given) for of in said]
     given: FloatArray = np.linalg.inv(np.mean(precision, axis=0)) / POOLED
     cross = POOLED * given @ np.mean([p @ of.cross for p, of in zip(precision, said, strict=True)], axis=0)
-    # What windows differ in with deviations, while the parameters are the same, tells of the deviations, too.
+    # What windows differ in with deviations, while the parameters are the same, is evidence on the deviations, too.
     apart = [(of.cross - cross).T @ p @ (of.cross - cross) for p, of in zip(precision, said, strict=True)]
     information_of = np.mean([of.information for of in said], axis=0) + np.mean(apart, axis=0)
     information: FloatArray = POOLED * 0.5 * (information_of + information_of.T)

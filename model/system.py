@@ -210,9 +210,9 @@ class System:
     def needed(self) -> tuple[frozenset[str], ...]:
         """Sets of channels of inputs, of each of which a window must contain one at least.
 
-        Where signals superpose, whatever one support does can be told from the others': one input is enough.  Laws act
-        along deflections, so that every support must be measured, and not by its acceleration alone.  A speed that is
-        missing is estimated.
+        Where signals superpose, the motion of one support can be separated from that of the others: one input is
+        enough.  Laws act along deflections, so that every support must be measured, and not by its acceleration alone.
+        A speed that is missing is estimated.
         """
         if self.on_track or not self.inputs:
             return ()

@@ -23,7 +23,7 @@ from sprung.replay.stamps import LATEST, SECOND, Stamps, is_written
 
 ROWS = 16_384  # that are handed out together
 MOST_COLUMNS = 10_000
-NAMES = 12  # that an error tells
+NAMES = 12  # that an error lists
 TIME_NAMES = (
     *("time", "t", "timestamp", "timestamps", "time stamp", "datetime", "date time", "date/time", "seconds", "secs"),
     *("sec", "elapsed time", "elapsed", "zeit", "zeitstempel", "temps", "tempo", "tiempo", "x_time", "rel time"),

@@ -23,7 +23,7 @@ from sprung.replay.tables import Column, EvenTimes, lost, whole
 BORDER = b"    -1"
 TIME_RESPONSE, TIME = 1, 17  # function type; specific data type of the abscissa
 KINDS = {2: ("f4", 1), 4: ("f8", 1), 5: ("f4", 2), 6: ("f8", 2)}  # ordinate: type, numbers per value
-MOST_DAMAGED = 20  # damaged datasets that are told one by one
+MOST_DAMAGED = 20  # damaged datasets that are reported one by one
 DIRECTIONS = {0: "", 1: "+X", -1: "-X", 2: "+Y", -2: "-Y", 3: "+Z", -3: "-Z"}
 DIRECTIONS |= {4: "+RX", -4: "-RX", 5: "+RY", -5: "-RY", 6: "+RZ", -6: "-RZ"}
 _DATES = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S", "%d-%b-%y", "%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M:%S")

@@ -151,8 +151,8 @@ class Housekeeping:
 
         with self._store.write() as connection:
             forgotten = retention.forget(connection, limits, archived)
-            told = [row for *_, row in outbox.newest_of_sources(connection)]
-            outbox.forget_deliveries(connection, now - DELIVERIES_KEPT, told)
+            newest = [row for *_, row in outbox.newest_of_sources(connection)]
+            outbox.forget_deliveries(connection, now - DELIVERIES_KEPT, newest)
             if not keep:
                 connection.rollback()
                 return forgotten

@@ -39,7 +39,7 @@ def insist(work: Callable[[], T], what: str, check: Callable[[], None]) -> T:
         except Exception as error:
             if not passes(error):
                 raise
-            log.error("%s: %s; trying again in %.1f s", what, told(error), retry)
+            log.error("%s: %s; trying again in %.1f s", what, message_of(error), retry)
         until = time.monotonic() + retry
         while time.monotonic() < until:
             check()
@@ -47,7 +47,7 @@ def insist(work: Callable[[], T], what: str, check: Callable[[], None]) -> T:
         retry = min(2.0 * retry, LAST_RETRY)
 
 
-def told(error: Exception) -> str:
+def message_of(error: Exception) -> str:
     """One line on what was refused."""
     strerror = error.strerror if isinstance(error, OSError) else None
     return strerror or first_line(error) or type(error).__name__

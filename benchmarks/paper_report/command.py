@@ -27,20 +27,20 @@ def run(data: Path | None = None, document: Path | None = None, *, only: str | N
     places = None if only is None else [part.strip() for part in only.split(",")]
     try:
         if data is not None:
-            yield from _told(refresh(data, page, places), only)
+            yield from _summary(refresh(data, page, places), only)
             return
-        told = []
+        refreshed = []
         for kept, kinds in PLACES.items():
             wanted = [place for place in places or kinds if place.partition(" ")[0] in kinds]
             if wanted:
                 with opened(kept) as folder:
-                    told += refresh(folder, page, wanted)
-        yield from _told(told, only)
+                    refreshed += refresh(folder, page, wanted)
+        yield from _summary(refreshed, only)
     except (ValueError, OSError) as error:
         raise UserError(f"bench paper-report: {error}") from error
 
 
-def _told(written: list[dict[str, Any]], only: str | None) -> list[dict[str, Any]]:
+def _summary(written: list[dict[str, Any]], only: str | None) -> list[dict[str, Any]]:
     """What was written, if anything was."""
     if not written:
         raise UserError(f"bench paper-report: no rows for any place{f' of {only}' if only else ''} of the document")

@@ -66,14 +66,14 @@ def run(
         raise UserError(f"bench paper-keep: {data}: no rows{f' of {methods}' if methods else ''}")
     place = archive or ARCHIVE
     files = _read(place)
-    told: dict[tuple[str, str], list[int]] = {}
+    seeds_of: dict[tuple[str, str], list[int]] = {}
     for row in chosen:
         name = row_name(row, row.get("seed", 0))
         files[f"{kept}/rows/{name}.json"] = (json.dumps(row) + "\n").encode()
         errors = data / "errors" / f"{name}.npz"
         if errors.is_file():
             files[f"{kept}/errors/{name}.npz"] = _single(errors)
-        told.setdefault((row["task"], name_of(row)), []).append(row.get("seed", 0))
+        seeds_of.setdefault((row["task"], name_of(row)), []).append(row.get("seed", 0))
     together = [json.loads(text) for name, text in files.items() if name.startswith(f"{kept}/rows/")]
     if mixed := of_several_arithmetics(together):
         raise UserError(
@@ -83,7 +83,7 @@ def run(
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as file:
         for name in sorted(files):
             file.writestr(zipfile.ZipInfo(name), files[name], zipfile.ZIP_DEFLATED)
-    for (task, method), seeds in told.items():
+    for (task, method), seeds in seeds_of.items():
         yield {"kept": kept, "task": task, "method": method, "seeds": seeds}
 
 

@@ -65,7 +65,7 @@ class _WindowByWindow(ABC):
     def examine(
         self, windows: FloatArray, weigh: BoolArray, known: Sequence[tuple[MeasurementFault, ...]] = ()
     ) -> list[Estimate]:
-        """As `identify`: without measured inputs, sensors that are wrong are not told from forces."""
+        """As `identify`: without measured inputs, wrong sensors cannot be distinguished from forces."""
         return self.identify(windows)
 
     @abstractmethod

@@ -8,8 +8,8 @@ with A the signals per force, V the sensors' noise, and T b what the state at th
 end: impulses and steps of every degree of freedom, A and j w A, with real coefficients b.  A few powers of j w in every
 signal take what leaks from outside the band, and what sampling folds back into it.  b is projected out, so that a free
 decay (L next to nothing), a shaken structure and everything between are one case, and a window of some ten periods
-tells a frequency far closer than its bins are apart.  (Pintelon, Schoukens: transients of finite records; the
-likelihood is Whittle's.)
+determines a frequency far more closely than its bins are spaced.  (Pintelon, Schoukens: transients of finite records;
+the likelihood is Whittle's.)
 """
 
 from __future__ import annotations

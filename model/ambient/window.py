@@ -21,7 +21,7 @@ from sprung.model.system import System
 SHARPEST, BLUNTEST = 0.002, 0.03  # width of a group of bins over its frequency
 BLURS = (0.1, 0.01, 0.001)  # see `Whittle`; steps on the way to none
 RIGID = 1e-6  # of the highest natural frequency: slower modes are motions of the whole without any spring
-CERTAIN = 20.0  # degrees of freedom of a mean of power that tells whether it stands out of the noise
+CERTAIN = 20.0  # degrees of freedom of a mean power from which it is known whether it stands out of the noise
 SLOPE = 2  # groups of bins in which the spectrum falls where the excitation ends, and into which it leaks
 LOAD_STD = 0.3  # of a body's mass that varies, where the file states no range
 

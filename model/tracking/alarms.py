@@ -29,7 +29,7 @@ from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
 from sprung.model.tracking.weather import WeatherModel
 
-_TOGETHER = 0.25  # share of a common change that all kinds of a quantity have at least, to be told as one of them all
+_TOGETHER = 0.25  # share of a common change that every kind of a quantity has at least, to be reported as one of all
 HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped", "silent", "noisy")
 
 

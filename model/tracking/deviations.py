@@ -206,7 +206,7 @@ def _drift_opened(record: DeviationRecord, model: DeviationModel, belief: Belief
 def without_data_sheets(
     record: DeviationRecord, model: DeviationModel, belief: Belief
 ) -> tuple[FloatArray, FloatArray]:
-    """Deviations (H,) and their covariance (H, H) as they are told, where channels may be defective.
+    """Deviations (H,) and their covariance (H, H) as reported, where channels may be defective.
 
     Held by a tolerance of 1.5 %, a gain that has been 1.05 from the beginning would seem to be 1.035, and the rest in
     other channels.  The tolerance of a channel for which a defect is likelier is therefore taken back out of the

@@ -20,8 +20,8 @@ REFERENCE = 0.5  # standard deviations of prediction and window: half of the sma
 THRESHOLD = 14.0  # exp(2 * 0.5 * 14) = 1.2e6 windows between false reopenings of one side of one parameter
 ALIKE = 0.35  # mean correlation of the errors of elements of a kind within a window, at most; measured: -0.06 to 0.34
 MOST = 4.0  # one score counts at most as this: four windows at least
-# Log-likelihood ratios of a jump at which half of it is uncertainty: what one window tells at most; and of a jump of
-# all of a kind, less, since chance gives them opposite signs
+# Log-likelihood ratios of a jump at which half of it is uncertainty: the evidence of one window at most; and of a jump
+# of all of a kind, less, since chance gives them opposite signs
 DOUBT, DOUBT_OF_KIND = 0.5 * MOST**2, 6.0
 
 
@@ -70,7 +70,7 @@ def update(
     down = np.maximum(0.0, cusum.down - score - idle)
     lost = np.maximum(up, down) >= THRESHOLD
     goes_on = (cusum.windows > 0) & (np.where(up >= down, cusum.score, -cusum.score) > 0)
-    # What chance had added up before a jump would hide how much its first window tells.
+    # What chance had added up before a jump would hide the evidence of its first window.
     goes_on &= np.abs(score) * np.sqrt(cusum.windows + 1) < np.abs(cusum.score + score)
     sums = np.where(goes_on, [cusum.score, cusum.windows, cusum.offset], 0.0)
     windows = sums[1] + mask

@@ -175,8 +175,8 @@ class Tracker:
 
         A vehicle at standstill counts as monitored.  A running one does not where its inputs show no motion or are
         frozen, or where windows do not fit in a curve (with a zero error of the yaw rate every window is a curve).
-        Where it runs too slowly for an estimate, the last one stays valid for a while.  A silent channel tells nothing
-        of whether it runs; while so many are silent that no window has told anything, it is not monitored.
+        Where it runs too slowly for an estimate, the last one stays valid for a while.  A silent channel is no evidence
+        of whether it runs; while so many are silent that no window was informative, it is not monitored.
         """
         speed = np.nan if conditions is None else conditions.speed
         frozen = not estimate.running and any(fault.kind != "silent" for fault in estimate.faults)
@@ -322,7 +322,7 @@ class Tracker:
     def known_faults(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
         """What identification should put right before it looks at a window: hard faults, gains and large delays.
 
-        What windows say is linear in gains and delays near those that were taken back; far from them it must be
+        The evidence of windows is linear in gains and delays near those that were taken back; far from them it must be
         refined once more, which costs several times as much.
         """
         hard, H = self.hard_faults(state), self.model.size

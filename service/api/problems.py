@@ -20,7 +20,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import BaseRoute, Match, Route
 
 from sprung.service.errors import NO_THREAD, Busy, NoSpace, NotFound, TooManyOfOne, UserError
-from sprung.service.observability.logs import TOLD
+from sprung.service.observability.logs import LOGGED
 from sprung.service.rendering.render import render
 
 MEDIA_TYPE = "application/problem+json"
@@ -166,7 +166,7 @@ def _as_problem(error: Exception) -> ApiProblem:
             return found
         case _:
             log.error("unexpected error", exc_info=error)
-            setattr(error, TOLD, True)
+            setattr(error, LOGGED, True)
             return ApiProblem(500, "an unexpected error; the service's log has the details")
 
 

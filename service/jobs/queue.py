@@ -20,7 +20,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import Busy, NotFound, UserError
-from sprung.service.insisting import insist, told
+from sprung.service.insisting import insist, message_of
 from sprung.service.observability.queues import WaitMetrics
 from sprung.service.store import Store, audit, work
 from sprung.service.times import NANOSECONDS, now_ns
@@ -82,7 +82,7 @@ class Progress:
             try:
                 found = work()
             except Exception as error:
-                self._trouble = told(error)
+                self._trouble = message_of(error)
                 raise
             self._trouble = ""
             return found

@@ -129,8 +129,8 @@ class Engines:
             self._not_too_large(parse_system_file(text, what), what)
             system = parse_system(text, what, shared.catalogue)
         except ValueError as error:
-            told = str(error)
-            raise UserError(told if told.startswith(what) else f"{what}: {told}") from error
+            reason = str(error)
+            raise UserError(reason if reason.startswith(what) else f"{what}: {reason}") from error
         differing = _differing(shared, system)
         if differing:
             raise UserError(f"{what}: {differing} of the service's system file are other ones")

@@ -41,9 +41,9 @@ class Notices:
         self._settings = settings
         self._store = store
         self._feeds = feeds
-        self._working: dict[str, bool] = {}  # as told last, by bus
+        self._working: dict[str, bool] = {}  # as reported last, by bus
         self._targets = receivers(settings)
-        senders.signing_key(settings.webhook_secret)  # wrong ones are told now
+        senders.signing_key(settings.webhook_secret)  # wrong ones are reported now
         self._allowed = outside.networks(settings.webhook_networks)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sprung-notify", daemon=True)
@@ -75,8 +75,8 @@ class Notices:
         feeds = self._feeds()
         if any(feed.name not in self._working for feed in feeds):
             with self._store.read() as connection:
-                told = outbox.newest_of_sources(connection)
-            self._working = {name: kind == events.FEED_FOUND for name, kind, _ in told} | self._working
+                newest = outbox.newest_of_sources(connection)
+            self._working = {name: kind == events.FEED_FOUND for name, kind, _ in newest} | self._working
         for feed in feeds:
             if self._working.get(feed.name, True) != feed.works:
                 base = self._settings.public_url

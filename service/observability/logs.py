@@ -58,13 +58,13 @@ def _plain(value: Any) -> str:
     return text if WORD.fullmatch(text) else json.dumps(text)
 
 
-TOLD = "sprung_told"  # attribute of an exception that is in the log already
+LOGGED = "sprung_logged"  # attribute of an exception that is in the log already
 
 
 def untold(record: logging.LogRecord) -> bool:
     """Whether an exception is not in the log yet: the server reports what the application has reported."""
     error = record.exc_info[1] if record.exc_info else None
-    return not getattr(error, TOLD, False)
+    return not getattr(error, LOGGED, False)
 
 
 def set_up(form: str, level: str) -> None:

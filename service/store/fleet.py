@@ -18,7 +18,7 @@ class TrackerRow:
     """A vehicle's tracker as it was after its last window."""
 
     last_window_ns: int
-    revision: int  # grows by one with every write: tells whether a copy in memory is still current
+    revision: int  # grows by one with every write: shows whether a copy in memory is still current
     state: dict[str, Any]
 
 

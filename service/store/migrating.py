@@ -30,15 +30,15 @@ def migrate(connection: Connection) -> None:
     try:
         command.upgrade(config, "head")
     except CommandError as error:  # a revision that this version does not know
-        told = f"{_name(connection)}: a newer version of Sprung has written it; nothing was changed"
-        raise UserError(told) from error
+        reason = f"{_name(connection)}: a newer version of Sprung has written it; nothing was changed"
+        raise UserError(reason) from error
 
 
 def _refuse_foreign(connection: Connection) -> None:
     tables = set(inspect(connection).get_table_names())
     if tables and VERSIONS not in tables:
-        told = f"a database of another program (it has a table {min(tables)!r}); choose another"
-        raise UserError(f"{_name(connection)}: {told}")
+        reason = f"a database of another program (it has a table {min(tables)!r}); choose another"
+        raise UserError(f"{_name(connection)}: {reason}")
 
 
 def _name(connection: Connection) -> str:

@@ -60,10 +60,14 @@ def newest_of_sources(connection: Connection) -> list[tuple[str, str, str]]:
     """(source, kind, id) of the newest events that tell of a source, of each."""
     source = deliveries.c.event["data"]["source"].as_string().label("source")
     query = select(deliveries.c.id, deliveries.c.kind, deliveries.c.created_ns, source)
-    told = query.where(source.is_not(None)).subquery()
-    last = select(told.c.source, func.max(told.c.created_ns).label("at")).group_by(told.c.source).subquery()
-    newest = and_(told.c.source == last.c.source, told.c.created_ns == last.c.at)
-    found = connection.execute(select(told.c.source, told.c.kind, told.c.id).join(last, newest))
+    of_sources = query.where(source.is_not(None)).subquery()
+    last = (
+        select(of_sources.c.source, func.max(of_sources.c.created_ns).label("at"))
+        .group_by(of_sources.c.source)
+        .subquery()
+    )
+    newest = and_(of_sources.c.source == last.c.source, of_sources.c.created_ns == last.c.at)
+    found = connection.execute(select(of_sources.c.source, of_sources.c.kind, of_sources.c.id).join(last, newest))
     return [(row.source, row.kind, row.id) for row in found]
 
 

@@ -117,7 +117,7 @@ def _imitating(pieces: Sequence[Part]) -> bool:
 
 
 def _undetermined(judged: JudgedComponent) -> list[int]:
-    """Which of several laws that leave more than noise might be absent by the deviations that are told of them.
+    """Which of several laws that leave more than noise might be absent by their stated deviations.
 
     Their sum is then one of many that make nearly the same force.
     """

@@ -15,7 +15,7 @@ _KNEES = (0.9, 1.1, 1.3, 1.5, 1.7, 1.9, 2.2)  # over the rate at which tanh turn
 def low_valve(fit: ComponentFit, index: int) -> ComponentFit | None:
     """The fit with the best valve in place of the friction at `index`; None without a friction or a plausible valve.
 
-    Its knee lies above what the motion passes within a sample: sharper, nothing tells it from friction.
+    Its knee lies above what the motion passes within a sample: a sharper one is indistinguishable from friction.
     """
     piece, task = fit.model.pieces[index], fit.task
     valve = piece.at_low_rates if isinstance(piece, Piece) else None

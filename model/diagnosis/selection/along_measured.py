@@ -83,7 +83,7 @@ class MeasuredMotion:
         return None if fit is None else cls(along, fit)
 
     def force_of(self, element: str) -> ForceAlongMotion:
-        """The force of an element: its own, and the unmeasured one of the body that tells it best.
+        """The force of an element: its own, and the unmeasured one of the body that determines it best.
 
         That is the body with the fewest other elements, whose errors it contains too; of two such, the mean.
         """

@@ -13,7 +13,7 @@ from sprung.model.system import System
 
 MARGIN = 2  # samples that a delay costs at either end beyond itself
 _DEAF = 0.9  # away from 1: a channel whose gain is nearly none shows noise, and its gain could be anything
-_SET_ANEW = 0.2  # of a window: what is left of it, once a delay is taken back from both ends, still tells
+_SET_ANEW = 0.2  # of a window: what is left once a delay is taken back from both ends is still informative
 
 
 class Corrections:
@@ -72,7 +72,7 @@ class Corrections:
         return out
 
     def credible(self, point: FloatArray) -> bool:
-        """Whether gains and delays are such as a window can still tell."""
+        """Whether gains and delays are such as a window can still determine."""
         gains, delays = np.abs(point[: 2 * self.channels]).reshape(2, -1)
         return bool(gains.max() < _DEAF and delays.max() < self.longest)
 

@@ -160,7 +160,7 @@ class WindowModel:
     def settled(self, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, WindowBatch]:
         """Initial states x0 (B, N) and windows whose lost inputs move as their sensors say, which fit each other.
 
-        Motion of a lost input is told as a periodic one, and needs another initial state than none.
+        Motion of a lost input is estimated as a periodic one, and needs another initial state than none.
         """
         for _ in range(_SETTLING if self.noise.lost else 0):
             data = self.with_lost(x, data)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-_BELIEVED = 0.01  # of the motion that a lost input may have at most: what it is believed to move by, where it is told
+_BELIEVED = 0.01  # of the motion that a lost input may have at most: its prior where it is estimated
 _APART = 1e-6  # of the largest, below which what a lost input brings to the signals is no direction of its own
 
 

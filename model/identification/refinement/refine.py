@@ -38,7 +38,7 @@ from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
 # A log-ratio less certain than this is reported as not identifiable: its 95 % interval spans a factor of 1.8 to each
-# side, so that half the nominal value cannot be told from nearly all of it
+# side, so that half the nominal value is indistinguishable from nearly all of it
 IDENTIFIABLE_STD = 0.3
 WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
 NOISE_SHARE = 0.15  # of a sensitivity's power, at most
@@ -270,7 +270,7 @@ class Refiner:
         error = progress.error[rows]
         if states or self.model.noise.lost:
             path, shown = self.model.simulated(x, x0, data)
-        if self.model.noise.lost:  # the mean of a lost input is not told, and shifts all sensors
+        if self.model.noise.lost:  # the mean of a lost input is not determined, and shifts all sensors
             left = data.measured - shown[:, :, data.present]
             shown[:, :, data.present] += left.mean(dim=1, keepdim=True)
             error[:, data.present] = left.std(dim=1, correction=0)

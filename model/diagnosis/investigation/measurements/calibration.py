@@ -8,7 +8,7 @@ tolerances as prior (`gain_std`, `offset_std`, `delay_std` of an address), and t
 tolerance are reported and have no effect on the verdict; their uncertainty is part of that of all other values.
 
 With enough channels, one whose error is far larger than all others of its kind is a fault, however small: the
-instruments of one rig are comparable.  Where laws are missing, errors make up for them: such a fault is told only if
+instruments of one rig are comparable.  Where laws are missing, errors make up for them: such a fault is named only if
 the model leaves no more than noise.
 """
 

@@ -307,7 +307,7 @@ def _trial(whole: Investigation, index: int) -> Trial | None:
     if turned is None:
         return None
     other = fit_without(whole, index)
-    if other is None:  # it diverges: every sample tells the difference, by no number that could be stated
+    if other is None:  # it diverges: every sample is evidence, of an amount that cannot be stated
         reduction = gain = fit.count * float(np.log(fit.count))
     else:
         gain, reduction = gain_over(whole.problem, other, fit, rules.quiet)
