@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, date, datetime
 from typing import Annotated, Any, Literal
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
@@ -131,6 +132,17 @@ class TimeKey(Strict):
     unit: str | None = Field(default=None, description="s, ms, us, ns, min, h or d; default s")
     epoch: Epoch | None = Field(default=None, description="when time is 0: a date, Unix seconds, excel, labview ...")
     rate: float | None = Field(default=None, gt=0, description="samples per second of tables without a time column")
+    zone: str | None = Field(default=None, description="of dates that state none, as Europe/Berlin; default UTC")
+
+    @field_validator("zone")
+    @classmethod
+    def _known_zone(cls, name: str | None) -> str | None:
+        if name is not None:
+            try:
+                ZoneInfo(name)
+            except (ZoneInfoNotFoundError, ValueError, OSError):
+                raise ValueError(f"{name!r} is no time zone; give its name, as in Europe/Berlin or UTC") from None
+        return name
 
     def as_column(self) -> TimeColumn:
         """The column as readers need it."""
@@ -142,4 +154,4 @@ class TimeKey(Strict):
             epoch = round(self.epoch.timestamp() * 1e6) * 1000
         elif self.epoch is not None:
             epoch = round(self.epoch * 1e9)
-        return TimeColumn(self.column, unit, epoch, self.rate)
+        return TimeColumn(self.column, unit, epoch, self.rate, self.zone)

@@ -53,6 +53,7 @@ class TimeColumn:
     seconds: float | None = None  # one unit of it, s
     epoch: int | None = None  # ns since the Unix epoch at which it is 0
     rate: float | None = None  # samples per second of a table without times
+    zone: str | None = None  # of dates without one, as in "Europe/Berlin"; None: UTC
 
 
 ANY_TIME = TimeColumn()

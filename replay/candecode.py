@@ -24,6 +24,7 @@ from sprung.model.signals import BoolArray, Channel, FloatArray, SampleBlock
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.candatabase import load_database
 from sprung.replay.frames import EXTENDED, ByteArray, FrameBlock, WordArray, id_text, last_byte, raw_bits
+from sprung.replay.statedunits import compare_units
 
 INVALID_CHOICE = re.compile(
     r"invalid|not[ _]?(available|avail|valid|supported|defined|used)|unavailable|unknown|undefined|"
@@ -67,8 +68,10 @@ class SignalPlan:
     """One wanted signal: bits -> number -> physical value, and when it is there at all."""
 
     channel: int
+    name: str
     bits: Bits
     kind: str  # "uint", "int" or "float"
+    unit: str | None  # as the database states it
     scale: float
     offset: float
     minimum: float | None
@@ -156,6 +159,11 @@ class CanDecoder:
         database = dbc if isinstance(dbc, Database) else load_database(Path(dbc))
         self.plans = sorted(_plan(channels, database), key=lambda plan: plan.frame_id)
         self.ids = np.array([plan.frame_id for plan in self.plans], dtype=np.uint32)
+        self._stated = [
+            (channels[signal.channel], f"{plan.name}.{signal.name}", signal.unit)
+            for plan in self.plans
+            for signal in plan.signals
+        ]
         most = max(len(plan.signals) for plan in self.plans)
         self.table = np.full((len(self.plans) + 1, most), -1, dtype=np.int32)  # channels of a message; last: foreign
         for row, plan in enumerate(self.plans):
@@ -209,6 +217,10 @@ class CanDecoder:
         account.drop(lost, "no valid value")
         account.tally.used += len(data) - lost
         return None
+
+    def compare_units(self, account: Account) -> None:
+        """Note the signals that the database has in another unit than the system file reads."""
+        compare_units(self._stated, account)
 
     def _count_foreign(self, ids: NDArray[np.uint32], account: Account) -> None:
         for frame_id, count in zip(*(part.tolist() for part in np.unique(ids, return_counts=True)), strict=True):
@@ -304,8 +316,10 @@ def _signal_plan(index: int, signal: Signal, signals: dict[str, Signal], message
     minimum, maximum = _binding_limits(signal) if ranged else (None, None)
     return SignalPlan(
         channel=index,
+        name=signal.name,
         bits=bits,
         kind="float" if conversion.is_float else "int" if signal.is_signed else "uint",
+        unit=signal.unit,
         scale=scale,
         offset=offset,
         minimum=minimum,

@@ -80,6 +80,9 @@ class LiveBus:
         self._asked = 0.0
         self._told = False  # who has to know that it is not only listened to
         self._decoder = CanDecoder(channels, dbc)
+        self._decoder.compare_units(self.account)
+        for line in self.account.problems:
+            log.warning("%s: %s", self.name, line)
         self._plausibility = PlausibilityCheck(channels, self.account, converter(channels))
         self._ids = frozenset(self._decoder.ids.tolist())
         self._latency = latency

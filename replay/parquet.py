@@ -26,7 +26,10 @@ def blocks(path: Path, channels: Sequence[Channel], account: Account, time: Time
     try:
         with pq.ParquetFile(path) as file:
             names = file.schema_arrow.names
-            rows = Rows(path, names, units(file), channels, stamped(file.schema_arrow, time), account)
+            time = stamped(file.schema_arrow, time)
+            rows = Rows(
+                path, names, units(file), channels, time, account, zoned=not _zoneless(file.schema_arrow, names, time)
+            )
             check_samples(path, file.metadata.num_rows * max(len(rows.columns), 1))
             _check_unpacked(path, file.metadata)
             wanted = ([] if rows.time is None else [names[rows.time]]) + [names[i] for i in rows.columns]
@@ -45,6 +48,15 @@ def stamped(schema: Any, time: TimeColumn) -> TimeColumn:
     if time.rate is not None or len(stamps) != 1 or time_name(schema.names, time) is not None:
         return time
     return replace(time, name=stamps[0])
+
+
+def _zoneless(schema: Any, names: Sequence[str], time: TimeColumn) -> bool:
+    """Whether the times are stamps of which the file does not say in which zone they are."""
+    import pyarrow as pa
+
+    name = time_name(names, time)
+    kind = schema.field(name).type if name in names else None
+    return kind is not None and pa.types.is_timestamp(kind) and kind.tz is None
 
 
 def listing(path: Path, time: TimeColumn) -> tuple[list[tuple[str, str | None]], TimeColumn]:

@@ -240,5 +240,6 @@ def _series(path: Path, channels: Sequence[Channel], account: Account, time: Tim
 
 
 def _decoded(frames: Iterator[FrameBlock], decoder: CanDecoder, account: Account) -> Iterator[SampleBlock]:
+    decoder.compare_units(account)
     for block in frames:
         yield decoder.decode(block, account)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from datetime import date
+from datetime import date, datetime, timedelta
 from fractions import Fraction
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,20 +23,23 @@ _WRITTEN = re.compile(
     r"(?P<hour>\d{1,2}):(?P<minute>\d{2})(?::(?P<second>\d{2})(?:[.,:](?P<fraction>\d{1,9})\d*)?)?"
     r"\s*(?P<half>[AaPp][Mm])?\s*(?P<zone>[Zz]|UTC|GMT|[+-]\d{2}:?\d{2})?\s*$"
 )
-SECOND, DAY = 10**9, 86_400 * 10**9  # ns
+SECOND, HOUR, DAY = 10**9, 3600 * 10**9, 86_400 * 10**9  # ns
 
 
 class Stamps:
     """Turns the cells of one time column into nanoseconds; `account.relative` is set if they count from a start."""
 
-    def __init__(self, time: TimeColumn, unit: float | None, account: Account) -> None:
-        """`unit`: of the column by its header, s."""
+    def __init__(self, time: TimeColumn, unit: float | None, account: Account, *, zoned: bool = True) -> None:
+        """`unit`: of the column by its header, s; `zoned`: dates that are no text are in UTC, not in a local time."""
         self.time = time
+        self.zoned = zoned
         self.seconds = time.seconds or unit
         self.account = account
         self._first: Any = None  # the first stamp as recorded, and its ns
         self._base = 0
         self._dates: dict[str, int] = {}
+        self._zone = ZoneInfo(time.zone) if time.zone else None
+        self._ahead: dict[int, int] = {}  # of UTC, ns, by the local hour since 1970
 
     def nanoseconds(self, cells: NDArray[Any] | Sequence[str]) -> tuple[IntArray, BoolArray]:
         """Stamps and which of them are sound; the others are 0."""
@@ -44,7 +48,11 @@ class Stamps:
         if cells.dtype.kind == "M":
             whole = cells.astype("datetime64[ns]")
             good = ~np.isnat(whole)
-            return np.where(good, whole.astype(np.int64), 0), good
+            stamps = np.where(good, whole.astype(np.int64), 0)
+            if not self.zoned:
+                hours, place = np.unique(stamps // HOUR, return_inverse=True)
+                stamps = stamps - np.array([self._local(int(hour)) for hour in hours], dtype=np.int64)[place]
+            return stamps, good
         return self._counted(cells)
 
     def _counted(self, cells: NDArray[Any]) -> tuple[IntArray, BoolArray]:
@@ -110,11 +118,26 @@ class Stamps:
             if day is None:
                 return None
             self._dates[match["date"]] = day
-        zone = match["zone"] or "Z"
-        shift = 0
+        local = self._dates[match["date"]] * DAY + of_day
+        zone = match["zone"]
+        if zone is None:
+            return local - self._local(local // HOUR)
         if zone[0] in "+-":
-            shift = (int(zone[1:3]) * 3600 + int(zone[-2:]) * 60) * (1 if zone[0] == "+" else -1)
-        return self._dates[match["date"]] * DAY + of_day - shift * SECOND
+            return local - (int(zone[1:3]) * HOUR + int(zone[-2:]) * 60 * SECOND) * (1 if zone[0] == "+" else -1)
+        return local
+
+    def _local(self, hour: int) -> int:
+        """How far dates without a zone are ahead of UTC, ns; an hour that a zone has twice is the first one."""
+        if self._zone is None:
+            self.account.note(
+                "its dates state no time zone and are taken as UTC; if they are local times, write "
+                "`time: {zone: Europe/Berlin}` into the system file (`zone: UTC` if not)"
+            )
+            return 0
+        if hour not in self._ahead:
+            offset = (datetime(1970, 1, 1, tzinfo=self._zone) + timedelta(hours=hour)).utcoffset()
+            self._ahead[hour] = 0 if offset is None else round(offset.total_seconds()) * SECOND
+        return self._ahead[hour]
 
     def _day(self, text: str, american: bool) -> int | None:
         """Days since 1970."""

@@ -20,6 +20,7 @@ from sprung.replay.bounds import check_samples
 from sprung.replay.csvlayout import number, unit_in
 from sprung.replay.multirate import MultirateColumns
 from sprung.replay.stamps import LATEST, SECOND, Stamps, is_written
+from sprung.replay.statedunits import compare_units
 
 ROWS = 16_384  # that are handed out together
 MOST_COLUMNS = 10_000
@@ -180,7 +181,9 @@ class Rows:
         *,
         timed: bool = False,
         csv: bool = False,
+        zoned: bool = True,
     ) -> None:
+        """timed: its first column is the time; zoned: dates that are no text are in UTC."""
         if len(names) > MOST_COLUMNS:
             raise UnreadableRecording(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are read")
         for name in names:
@@ -196,10 +199,11 @@ class Rows:
             if self.time is None:
                 raise no_time(path, names, time)
         found = find_columns(path, names, channels, account, csv=csv)
+        compare_units(((channels[place], names[at], units[at]) for place, at in found), account)
         self.columns = [column for _, column in found]
         self._index = np.array([place for place, _ in found], dtype=np.int32)
         unit = None if self.time is None else seconds_of(units[self.time])
-        self._stamps = Stamps(time, unit, account)
+        self._stamps = Stamps(time, unit, account, zoned=zoned)
         self._rows = 0
         self._slower = MultirateColumns()
         if self.time is None:
@@ -239,6 +243,7 @@ def column_blocks(
         if column.lacking:
             account.problem(f"{column.name}: {column.lacking} of its values are not there, or are no numbers")
     found = find_columns(path, names, channels, account)
+    compare_units(((channels[place], names[at], _unit_of(columns[at])) for place, at in found), account)
     check_samples(path, sum(columns[at].length for _, at in found))
     by_time: dict[Any, list[tuple[int, Column]]] = {}
     for place, at in found:
@@ -256,6 +261,11 @@ def column_blocks(
         )
         order = np.argsort(block.time, kind="stable") if len(waiting) > 1 else slice(None)
         yield SampleBlock(block.time[order], block.channel[order], block.value[order])
+
+
+def _unit_of(column: Column) -> str | None:
+    """The unit that a column states, by itself or in its name."""
+    return column.unit or unit_in(column.name.rsplit("/", 1)[-1])[1]
 
 
 def time_of(path: Path, column: Column, columns: Sequence[Column], time: TimeColumn) -> Column | EvenTimes:
@@ -308,7 +318,7 @@ class _Series:
         self.length = members[0][1].length
         unit = None
         if isinstance(time, Column):
-            unit = seconds_of(time.unit) or seconds_of(unit_in(time.name.rsplit("/", 1)[-1])[1])
+            unit = seconds_of(time.unit) or seconds_of(_unit_of(time))
         self._stamps = Stamps(key, unit, account)
         self._slower = MultirateColumns()
         self._epoch = key.epoch or 0
