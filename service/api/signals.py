@@ -134,7 +134,7 @@ def choose(
     if alarm is None:
         return last, _of(last, "the newest samples of the vehicle") if last else "no recent samples are held"
     stretch = alarm_signals.best(stretches, alarm.onset, alarm.opened)
-    what = f"alarm {alarm.id} ({alarm.parameter or 'windows no longer fit the model'})"
+    what = f"alarm {alarm.id} ({alarm.parameter or 'windows do not fit the model'})"
     if stretch is not None and stretch.covers(alarm.onset):
         return stretch, _of(stretch, f"the onset of {what} at {to_iso(alarm.onset)}")
     if stretch is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from rich.table import Table
 from rich.text import Text
 
@@ -17,6 +19,7 @@ COLUMNS = {  # of the table of parameters, and the width from which they are sho
     "drift": 0,
     "state": 0,
 }
+DRIFT_STD = 104  # characters: the width from which drifts have their deviations
 HEALTH_STYLE = {"ok": "green", "maintenance_required": "yellow"}
 
 
@@ -39,12 +42,19 @@ def parameter_table(view: VehicleView, width: int = 120) -> Table:
             "± std": quantity(p.std, p.unit) if known else "–",
             "nominal": quantity(p.nominal, p.unit),
             "ratio": f"{p.value / p.nominal:.3f}" if known else "–",
-            "drift": percent(p.drift),
+            "drift": _drift(p.drift, p.drift_std if width >= DRIFT_STD else None),
             "state": _state(p.alarm, known, p.drift, p.lost_with),
         }
         colour = {"alarm": "red", "warning": "yellow"}.get(p.alarm or "")
         table.add_row(*(cells[name] for name in shown), style=colour)
     return table
+
+
+def _drift(drift: float | None, std: float | None) -> str:
+    """A change from the vehicle's baseline, `-29.8 ± 0.1 %`."""
+    if std is None or not math.isfinite(std):
+        return percent(drift)
+    return percent(drift).replace(" %", f" ± {100 * std:.1f} %")
 
 
 def _state(alarm: str | None, identifiable: bool, drift: float | None, lost: str | None) -> str:

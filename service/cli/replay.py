@@ -6,12 +6,13 @@ import json
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from sprung.model.signals import Channel
 from sprung.service.cli.apart import own_limits, readable
 from sprung.service.cli.console import print_table, width_of_output
 from sprung.service.cli.parameters import parameter_table
@@ -31,7 +32,7 @@ from sprung.service.monitoring.views import (
     vehicle_view,
     window_dict,
 )
-from sprung.service.monitoring.words import size_in_words
+from sprung.service.monitoring.words import fault_in_words, size_in_words
 from sprung.service.settings import Settings, settings_with
 from sprung.service.sources.feed import FeedResult, comfort_dict, feed_file
 from sprung.service.store import open_store
@@ -147,7 +148,7 @@ def _report(pipeline: Pipeline, path: Path, fed: FeedResult, json_lines: bool) -
         print(json.dumps({"summary": summary(pipeline, view, fed)}), flush=True)
     else:
         print_table(parameter_table(replace(view, health=health(view, fed)), width_of_output()))
-        print(closing_line(view, fed))
+        print(closing_line(view, fed, pipeline.engine.system.channels))
     complaint = incomplete_line(path, fed)
     for line in fed.problems:
         if line not in (complaint or ""):
@@ -190,8 +191,8 @@ def slower_line(fed: FeedResult, speed: float) -> str | None:
     return f"--speed {speed:g} was asked for and {pace:.2g} reached: this machine, busy as it is, is no faster"
 
 
-def closing_line(view: VehicleView, fed: FeedResult) -> str:
-    """Closing line: data read, speed, and alarms."""
+def closing_line(view: VehicleView, fed: FeedResult, channels: Sequence[Channel]) -> str:
+    """Closing line: data read, speed, and alarms.  channels: of the system."""
     recorded = fed.recorded_seconds
     counts = ", ".join(f"{count} {outcome}" for outcome, count in fed.windows.items())
     pace = recorded / max(fed.wall_seconds, 1e-9)
@@ -201,21 +202,20 @@ def closing_line(view: VehicleView, fed: FeedResult) -> str:
     if fed.stored_before:
         lines.append(f"{fed.stored_before} window{'s were' if fed.stored_before != 1 else ' was'} in the store already")
     for alarm in view.active:
-        what = changed_part(alarm) or "windows no longer fit the model"
+        what = changed_part(alarm) or "windows do not fit the model"
         advice = "; `sprung diagnose` looks for the cause" if alarm.kind == "misfit" else ""
         change = f" {size_in_words(alarm.parameter, alarm.change, alarm.std)}".rstrip()
         apart = "; the measurements do not distinguish them" if alarm.alternatives else ""
         lines.append(f"{alarm.severity}: {what}{change} since {to_iso(alarm.onset)}{apart}{advice}")
-    return "\n".join([*lines, *measurement_lines(view.measurements())])
+    return "\n".join([*lines, *measurement_lines(view.measurements(), {c.name: c.unit for c in channels})])
 
 
-def measurement_lines(found: dict[str, Any]) -> list[str]:
-    """What was found wrong with measurements, and the loads."""
+def measurement_lines(found: dict[str, Any], units: Mapping[str, str]) -> list[str]:
+    """What was found wrong with measurements, and the loads.  units: of the channels."""
     lines = []
     for fault in found.get("sensors", []):
-        value = "" if fault.get("value") is None else f" {fault['value']:.4g}"
-        std = "" if fault.get("std") is None else f" ± {fault['std']:.2g}"
-        lines.append(f"sensor: {fault['channel']} {fault['kind']}{value}{std}")
+        unit = units.get(fault["channel"], "")
+        lines.append(f"sensor: {fault['channel']} {fault_in_words(fault['kind'], fault['value'], fault['std'], unit)}")
     lines += [
         f"system file: {one['body']} is {100 * one['change']:+.1f} % ± {100 * one['std']:.1f} % in {one['what']}"
         for one in found.get("built", [])

@@ -54,7 +54,7 @@ def watch(path: Path, core: Core) -> tuple[OnBatch, Callable[[FeedResult], None]
         assert fed.state is not None
         view = vehicle_view(core.engine, fed.vehicle, fed.state, None)
         print_table(parameter_table(replace(view, health=health(view, fed)), width_of_output()))
-        print(closing_line(view, fed), flush=True)
+        print(closing_line(view, fed, system.channels), flush=True)
         complaint = incomplete_line(path, fed)
         if complaint:
             print(f"sprung: {complaint}", file=sys.stderr, flush=True)

@@ -95,8 +95,8 @@ def _compared(file: McapSink, engine: Engine, window: Compared) -> None:
 
 def _alarm(file: McapSink, alarm: AlarmRow) -> None:
     level = ERROR if alarm.severity == "alarm" else WARNING
-    what = changed_part(alarm) or "windows no longer fit the model"
-    change = f" {size_in_words(alarm.parameter, alarm.change)}".rstrip()
+    what = changed_part(alarm) or "windows do not fit the model"
+    change = f" {size_in_words(alarm.parameter, alarm.change, alarm.std)}".rstrip()
     file.event(alarm.onset, level, alarm.kind, f"{alarm.severity}: {what}{change}: begins here")
     file.event(alarm.opened, level, alarm.kind, f"{alarm.severity}: {what}{change}: raised")
     if alarm.closed is not None:

@@ -88,9 +88,9 @@ def sentence(event: dict[str, Any]) -> str:
     data = event["data"]
     if event["type"].startswith("sprung.alarm."):
         alarm = data["alarm"]
-        kind = {"misfit": "windows no longer fit the model"}.get(alarm["kind"], alarm["kind"])
+        kind = {"misfit": "windows do not fit the model"}.get(alarm["kind"], alarm["kind"])
         what = " or ".join([*alarm.get("alternatives", ()), spoken(alarm["parameter"] or "") or kind])
-        change = f" {size_in_words(alarm['parameter'], alarm['change'])}".rstrip()
+        change = f" {size_in_words(alarm['parameter'], alarm['change'], alarm['std'])}".rstrip()
         return f"{data['vehicle']}: {alarm['severity']} {event['type'].rsplit('.', 1)[1]}: {what}{change}"
     if event["type"] == REPORT_READY:
         return f"{data['vehicle'] or 'recording'}: mismatch report: {data['verdict'].replace('_', ' ')}"

@@ -98,7 +98,7 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
     if misfit is not None:
         cause = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."
         text = f"{_since(misfit)}. {cause}"
-        found.append(Hint("warning", "Windows no longer fit the model", text))
+        found.append(Hint("warning", "Windows do not fit the model", text))
     if any(a.kind == "load" for a in active):
         found.append(Hint("warning", "Load out of range", "Check the load sensor, or the loading of the vehicle."))
     if row.earlier:

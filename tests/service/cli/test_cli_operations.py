@@ -163,7 +163,7 @@ def test_a_finding_is_told_once_unless_advice_hangs_on_it() -> None:
 
 
 def test_a_load_that_is_none_has_no_minus() -> None:
-    assert measurement_lines({"load": {"car": [-0.3, 9.0]}}) == ["load: car +0 ± 9 kg against nominal"]
+    assert measurement_lines({"load": {"car": [-0.3, 9.0]}}, {}) == ["load: car +0 ± 9 kg against nominal"]
     assert percent(-0.0001) == "+0.0 %"
 
 
@@ -174,6 +174,16 @@ def test_narrow_tables_keep_whole_names(engine: Engine) -> None:
         heads = [str(column.header) for column in table.columns]
         assert heads[0] == "parameter" and {"drift", "state"} <= set(heads)
         assert ("nominal" in heads) == (width >= 84)
+
+
+def test_wide_tables_state_how_well_a_drift_is_known(engine: Engine) -> None:
+    view = vehicle_view(engine, "a", engine.tracker.initial_state(), None)
+    first = replace(view.parameters[0], drift=-0.2983, drift_std=0.0012)
+    view = replace(view, parameters=(first, *view.parameters[1:]))
+    for width, shown in ((120, "-29.8 ± 0.1 %"), (80, "-29.8 %")):
+        drift = next(column for column in parameter_table(view, width).columns if column.header == "drift")
+        cells = [str(cell) for cell in drift.cells]
+        assert cells[0] == shown and cells[1] == "–"
 
 
 def test_doctor_tells_what_works_and_what_does_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -384,7 +384,7 @@ def test_a_change_that_may_be_a_sensor_s_is_reported_with_the_sensor_first() -> 
         "change", "primary_11l.damping", 1, 2, "warning", -0.153, 0.012, -0.153, alternatives=("bogie1_1l.gain",)
     )
     event = alarm_event("", "car-17", AlarmChange("opened", alarm, None), now_ns())
-    assert sentence(event) == "car-17: warning opened: bogie1_1l.gain or primary_11l.damping -15.3 %"
+    assert sentence(event) == "car-17: warning opened: bogie1_1l.gain or primary_11l.damping -15.3 ± 1.2 %"
     assert event["data"]["advisory"].startswith("The measurements do not tell it from bogie1_1l.gain: check the sensor")
     assert changed_part(alarm) == "bogie1_1l.gain or primary_11l.damping"
     assert changed_part(replace(alarm, alternatives=())) == "primary_11l.damping"
