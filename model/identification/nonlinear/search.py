@@ -21,6 +21,8 @@ from sprung.model.identification.measurements.calibration import DeviationSensit
 from sprung.model.identification.nonlinear.initial import initial_iterate
 from sprung.model.identification.nonlinear.input_noise import input_noise_covariance
 from sprung.model.identification.nonlinear.iterate import Iterate, LinearStep, NormalEquations, SimulatedMotion
+from sprung.model.identification.nonlinear.normal import normal_equations, smoothed
+from sprung.model.identification.nonlinear.sensitivities import LawSensitivities
 from sprung.model.identification.nonlinear.tangent import TangentModel
 from sprung.model.identification.nonlinear.window import LawWindows
 from sprung.model.identification.refinement.refine import IDENTIFIABLE_STD, NOISE_SHARE, WEAK_STD, Refined
@@ -94,6 +96,7 @@ class LawSearch:
         work: WorkBudget,
     ) -> None:
         self.windows, self.calibration, self.data, self.wanted, self.work = windows, calibration, data, wanted, work
+        self.sensitivities = LawSensitivities(windows)
         B, U, T, N = len(start), windows.unknowns, windows.model.samples, windows.model.states_count
         self.reported, H = windows.reported, len(calibration.deviations) if weighs else 0
         unknowns = torch.zeros(B, U, dtype=torch.float64)
@@ -142,14 +145,14 @@ class LawSearch:
         point, before = self.point.take(rows), self.cost[rows]
         steps = w.steps(point, data)
         point, motion, nearby_tangent = w.settle(point, steps, data)
-        normal, tangent = w.normal_equations(point, steps, motion, data, smooth)
+        normal, tangent = normal_equations(self.sensitivities, point, steps, motion, data, smooth)
         residual = w.residual(motion.outputs, data, normal.whiten)
         cost, step, state_alone = normal.solve(residual, point.unknowns)
         squares = residual.square().sum(dim=(1, 2))
         worse = ~(squares <= self.squares[rows] * (1 + 1e-6) + _SLACK)
         step = self._limited(step)
         dx0 = normal.state_step(state_alone, step)
-        smooth = w.smoothed(normal, residual, step, dx0, steps)
+        smooth = smoothed(w, normal, residual, step, dx0, steps)
         std = torch.diagonal(normal.covariance, dim1=1, dim2=2).sqrt()
         second = self._second_step(normal, nearby_tangent, point.stepped(step, dx0), data)
         improved = second.squares <= squares * (1 + 1e-6) + _SLACK
@@ -223,7 +226,7 @@ class LawSearch:
         given = normal.carried, normal.compliance, steps.values
         clean, outputs = self.calibration.smoothed(normal, after, data, *given)
         after = replace(after, motion=replace(after.motion, outputs=outputs))
-        shown = self.windows.by_drive(normal, steps, tangent, self.calibration.motions(clean), data)
+        shown = self.sensitivities.by_drive(normal, steps, tangent, self.calibration.motions(clean), data)
         found = self.calibration.evidence(normal, after, data, shown)
         self.cross[rows] = found.cross[:, : self.reported]
         self.information[rows], self.score[rows], self.weighed[rows] = found.information, found.score, True

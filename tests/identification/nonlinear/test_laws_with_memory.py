@@ -9,6 +9,7 @@ import torch
 from sprung.model.identification.identify import load_identifier
 from sprung.model.identification.likelihood.linearise import WindowModel
 from sprung.model.identification.nonlinear.iterate import Iterate
+from sprung.model.identification.nonlinear.sensitivities import LawSensitivities
 from sprung.model.identification.nonlinear.window import LawWindows
 from sprung.model.identification.nonlinear.with_laws import acting_laws, without_laws
 from sprung.model.system import System, parse_system
@@ -113,7 +114,7 @@ def _sensitivities(vehicle: System, values: np.ndarray, first: int = 0) -> tuple
     steps = model.steps(point, data)
     along = model.along(motion.states, data, stationary, point, steps)
     tangent = model.tangent(along, point, steps)
-    columns = model.output_sensitivities(point, steps, motion, data, stationary, along, tangent)
+    columns = LawSensitivities(model).outputs(point, steps, motion, data, stationary, along, tangent)
     back = torch.linalg.pinv(model.model.compression.matrix(data.present))
     whitened = torch.as_tensor(np.diag(1 / bare.sensor_noise)) @ back
     found, expected = [], []
