@@ -309,6 +309,7 @@ class NoiseRules:
     inaccuracy: float = rule(0.05, "of the power that findings changed, which they may have wrong; chosen", 0.02, 0.1)
     upper: float = rule(0.38, "of the sample rate; derived: above, anti-alias filters cut", 0.34, 0.42)
     white: float = rule(0.5, "of the excess, that goes on above the band; derived: noise does, physics ends", 0.3, 0.7)
+    reach: float = rule(0.05, "of a sensor's noise power, that a support's noise makes up; chosen", 0.02, 0.1)
     bins: int = rule(20, "above the band, for the noise level; derived: their level is known to 20 %", 10, 40)
     blocks: int = rule(24, "of the band, whose median is a sensor's level; chosen: physics fills few", 12, 48)
     own: float = rule(0.01, "of a bin's variance, from which it informs on a sensor's own noise; chosen", 0.003, 0.03)

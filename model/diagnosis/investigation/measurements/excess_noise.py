@@ -37,10 +37,25 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
         supports = [state.signals.support_names[i] for i in pairs]
         d = (noise.displacement / declared.displacement)[pairs]
         v = (noise.velocity / declared.velocity)[pairs]
-        every = np.ones(len(pairs), dtype=bool)
-        found += outliers([f"{n}.displacement" for n in supports], d, every, rules.displacement * count, rules)
-        found += outliers([f"{n}.velocity" for n in supports], v, every, rules.velocity * count, rules)
+        reach = reaching_sensors(state)[pairs]
+        found += outliers([f"{n}.displacement" for n in supports], d, reach, rules.displacement * count, rules)
+        found += outliers([f"{n}.velocity" for n in supports], v, reach, rules.velocity * count, rules)
     return tuple(found)
+
+
+def reaching_sensors(state: Investigation) -> np.ndarray:
+    """Whether the noise of a support's motion is part of what any sensor shows, (supports,).
+
+    Where it is not, as with motions that were computed, displacement and velocity differ by their interpolation alone.
+    """
+    part, noise, forward = state.problem.part, state.problem.noise, state.fit.forward
+    bins = slice(1, part.grid.band.stop)
+    response = forward.of_inputs[bins][:, :, : len(noise.displacement)]
+    through = np.abs(response) ** 2 * noise.support_variance(part.grid.omega[bins])[:, None, :]
+    own = noise.sensor_variance(part.grid, part.differentiated)[bins, :, None]
+    share = np.mean(through / (own + np.sum(through, axis=2, keepdims=True)), axis=0)
+    found: np.ndarray = np.max(share, axis=0) > state.options.rules.noise.reach
+    return found
 
 
 def is_what_is_left(noise: np.ndarray, error: np.ndarray, rules: NoiseRules) -> np.ndarray:
@@ -71,7 +86,7 @@ def outliers(
 ) -> list[NoiseFault]:
     """Outliers among ratios (N,) of noise to declared noise, each by the others' median; fewer than two say nothing.
 
-    white (N,): whether the noise goes on above the compared band.  count: bins that inform on it.
+    white (N,): whether it is noise that counts: that of a sensor goes on above the compared band.  count: bins that inform on it.
     """
     found = []
     for i, name in enumerate(names):

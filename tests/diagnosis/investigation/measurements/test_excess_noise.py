@@ -4,13 +4,23 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks.shaken import building
+from sprung.model.diagnosis.api import diagnose
 from sprung.model.diagnosis.investigation.diagnose import begun
-from sprung.model.diagnosis.investigation.measurements.excess_noise import is_what_is_left, outliers, upper_ratio
+from sprung.model.diagnosis.investigation.measurements.excess_noise import (
+    is_what_is_left,
+    outliers,
+    reaching_sensors,
+    upper_ratio,
+)
 from sprung.model.diagnosis.investigation.measurements.floor import realised_floor
 from sprung.model.diagnosis.investigation.state import Options
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.holdout import FreeRun
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.ride import simulate_ride
+from sprung.model.system import load_system
+from tests.diagnosis_cases import MadeRecord
 
 NAMES = ["a", "b", "c", "d", "e"]
 EVERY = np.ones(5, dtype=bool)
@@ -65,3 +75,34 @@ def test_a_floor_is_at_most_the_error_that_contains_it() -> None:
     measured, errors = np.ones((2000, 3)), np.array([0.5, 1.01, 3.0])
     run = FreeRun(measured, measured, errors, None)  # type: ignore[arg-type]  # the point is not read
     assert realised_floor(np.ones(3), run).tolist() == [0.5, 1.01, 1.0]
+
+
+def _computed_road(seconds: float) -> tuple[FloatArray, FloatArray]:
+    """Displacements and velocities (T, 8) of eight wheels without any noise, some on a rougher track than others."""
+    rng = np.random.default_rng(44)
+    time, frequency = np.arange(int(100 * seconds)) / 100, np.linspace(0.3, 30.0, 200)
+    heights, rates = [], []
+    for rough in (0.2, 1.0, 0.3, 2.5, 0.2, 0.4, 1.5, 0.3):
+        size = 4e-4 / frequency * np.where(frequency > 15, rough, 1.0)
+        angle = 2 * np.pi * frequency * time[:, None] + rng.uniform(0, 2 * np.pi, 200)
+        heights.append(np.sin(angle) @ size)
+        rates.append(np.cos(angle) @ (2 * np.pi * frequency * size))
+    return np.column_stack(heights), np.column_stack(rates)
+
+
+def test_motions_without_noise_are_no_faulty_channels() -> None:
+    """Displacement and velocity of simulated wheels agree up to their interpolation, which differs with the track."""
+    system = load_system()
+    height, rate = _computed_road(20.0)
+    names = [channel.name for channel in system.inputs]
+    road = np.empty((len(height), len(names)))
+    road[:, [n.endswith(".displacement") for n in names]] = height
+    road[:, [n.endswith(".velocity") for n in names]] = rate
+    rng = np.random.default_rng(45)
+    sensors = simulate_ride(system, road, noise=rng).sensors
+    report = diagnose(system, MadeRecord(np.column_stack([road, sensors])))
+    assert report.findings == () and report.verdict == "consistent"
+
+    shown = road + rng.standard_normal(road.shape) * [channel.noise for channel in system.inputs]
+    state = begun(system, MadeRecord(np.column_stack([shown, sensors])), Options(), lambda share, what: None)
+    assert reaching_sensors(state).all()
