@@ -24,7 +24,7 @@ from sprung.benchmarks.sensitivity import figure, quoted
 from sprung.model.identification.measurements.deviations import CARGO, OWN, deviations
 from sprung.model.signals import Conditions, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System, load_system
-from sprung.model.tracking.alarms import LoadLimit
+from sprung.model.tracking.load_alarms import LoadLimit
 from sprung.model.tracking.rules import TRACKING_RULES, TrackingRules, reason
 from sprung.model.tracking.state import TrackerState
 from sprung.model.tracking.tracker import Tracker, TrackerSettings

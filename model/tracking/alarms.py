@@ -18,49 +18,25 @@ from itertools import takewhile
 
 import numpy as np
 
-from sprung.model.identification.measurements.deviations import Deviation, named
-from sprung.model.signals import FaultKind, FloatArray, IntArray, MeasurementFault
-from sprung.model.tracking import deviations as dev
+from sprung.model.identification.measurements.deviations import Deviation
+from sprung.model.signals import IntArray
 from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.deviation_model import DeviationModel
+from sprung.model.tracking.drift import Drift, common_change, is_between
 from sprung.model.tracking.jumps import Jump
+from sprung.model.tracking.load_alarms import LoadAlarms, LoadLimit
 from sprung.model.tracking.rules import AlarmRules
+from sprung.model.tracking.sensor_alarms import SensorAlarms
 from sprung.model.tracking.settings import TrackerSettings
-from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
+from sprung.model.tracking.state import Alarm, Severity, TrackerState
 from sprung.model.tracking.weather import WeatherModel
 
 _TOGETHER = 0.25  # share of a common change that every kind of a quantity has at least, to be reported as one of all
-HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped", "silent", "noisy")
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
-    """Posterior over baseline of every parameter."""
-
-    change: FloatArray  # value / baseline - 1 without the level common to all of a kind, shape (P,)
-    std: FloatArray
-    whole: FloatArray  # the same with that level, but for its slow part, which is attributed to weather
-
-
-@dataclass(frozen=True, slots=True)
-class LoadLimit:
-    """Limits of the load of a body."""
-
-    empty: float  # kg
-    least: float | None  # kg
-    most: float | None  # kg
-
-    def beyond(self, ratio: float) -> float:
-        """kg above the most, or (negative) below the least, of a mass whose logarithm over the empty one is `ratio`."""
-        carried = self.empty * float(np.expm1(ratio))
-        if self.most is not None and carried > self.most:
-            return carried - self.most
-        return min(0.0, carried - self.least) if self.least is not None else 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Attribution:
-    """Constants of one tracker that alarms need."""
+class VehicleAlarms:
+    """Opens, updates and closes the alarms of one vehicle, with the constants of its tracker."""
 
     names: tuple[str, ...]
     settings: TrackerSettings
@@ -75,24 +51,32 @@ class Attribution:
         return self.settings.rules.alarms
 
     @property
+    def _sensor_alarms(self) -> SensorAlarms:
+        return SensorAlarms(self.deviations, self.model, self._rules)
+
+    @property
+    def _load_alarms(self) -> LoadAlarms:
+        return LoadAlarms(self.deviations, self.limits, self._rules)
+
+    @property
     def kinds(self) -> list[str]:
         """Quantity of each parameter: "stiffness", "damping"."""
         return [name.rpartition(".")[2] for name in self.names]
 
     def updated(self, state: TrackerState, drift: Drift, jump: Jump | None, now: int) -> tuple[Alarm, ...]:
         """Alarms after a window whose centre is at `now`, ns."""
-        common, overloads, drifted = self._common_changes(state), self._overloads(state), self._drifted(state)
+        sensors, loads = self._sensor_alarms, self._load_alarms
+        common, overloads, drifted = self._common_changes(state), loads.overloads(state), sensors.drifted(state)
         if jump is None and not (common or overloads or drifted) and _nothing_is_wrong(state):
             return state.alarms
         alarms = [self._present(alarm, state, drift, now) for alarm in state.alarms]
-        if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= self.model.jump_limit(jump.kind):
-            alarms = self._with_sensor(alarms, jump, now)
-        alarms = self._narrowed(alarms, state, now)
-        alarms = self._with_drifted(alarms, drifted, state, now)
-        alarms = self._with_stuck(alarms, state, now)
+        alarms = sensors.with_jump(alarms, jump, now)
+        alarms = sensors.narrowed(alarms, state, now)
+        alarms = sensors.with_drifted(alarms, drifted, state, now)
+        alarms = sensors.with_stuck(alarms, state, now)
         alarms = self._with_common(alarms, common, drift, now)
         alarms = self._with_changes(alarms, state, drift, now)
-        alarms = self._with_overloads(alarms, overloads, now)
+        alarms = loads.opened(alarms, overloads, now)
         alarms = _with_misfit(alarms, state, now)
         return self._latest(alarms)
 
@@ -101,11 +85,11 @@ class Attribution:
         if alarm.closed is not None:
             return alarm
         if alarm.kind == "misfit":
-            return alarm if state.misfit_since is not None else _closed(alarm, now)
+            return alarm if state.misfit_since is not None else alarm.ended(now)
         if alarm.kind == "sensor":
-            return self._sensor_updated(alarm, state, now)
+            return self._sensor_alarms.updated(alarm, state, now)
         if alarm.kind == "load":
-            return self._load_updated(alarm, state, now)
+            return self._load_alarms.updated(alarm, state, now)
         name = alarm.parameter or ""
         if "*" in name:
             return self._kind_updated(alarm, name, state, drift, now)
@@ -115,18 +99,18 @@ class Attribution:
         """The alarm of elements that changed together, `primary_*.damping`."""
         members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
         if np.isnan(drift.whole[members]).all():  # all baselines are learned anew: there is nothing to compare with
-            return _closed(alarm, now)
+            return alarm.ended(now)
         still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, self._rules.recovered))
-        change, std = _common(replace(drift, change=drift.whole), members)
+        change, std = common_change(replace(drift, change=drift.whole), members)
         moved = state.changes.active[members].any() and abs(change) > self._rules.recovered * self._common_limit
         if not (still or moved):  # a change of one element alone does not keep the alarm of all open
-            return _closed(alarm, now)
+            return alarm.ended(now)
         return self._updated(alarm, change, std)
 
     def _single_updated(self, alarm: Alarm, i: int, state: TrackerState, drift: Drift, now: int) -> Alarm:
         """The alarm of parameter `i`."""
         if state.changes.active[i] == 0:
-            return _closed(alarm, now)
+            return alarm.ended(now)
         return self._updated(alarm, float(drift.change[i]), float(drift.std[i]))
 
     def _common_changes(self, state: TrackerState, share: float = 1.0) -> list[tuple[str, float, float]]:
@@ -176,40 +160,6 @@ class Attribution:
             out.append(self._updated(alarm, change, std))
         return out
 
-    def _overloads(self, state: TrackerState, certain: float | None = None) -> dict[str, tuple[float, float]]:
-        """Bodies whose load is beyond its limits: excess relative to the empty mass, and its standard deviation."""
-        found = {}
-        certain = self._rules.certain if certain is None else certain
-        H = len(self.deviations)
-        for h, deviation in enumerate(self.deviations):
-            limit = self.limits.get(deviation.name) if deviation.kind == "load" else None
-            if limit is None:
-                continue
-            value, std = float(state.belief.mean[-H:][h]), float(np.sqrt(state.belief.covariance.diagonal()[-H:][h]))
-            excess = limit.beyond(value) / limit.empty
-            if std < self._rules.load_known and abs(excess) > certain * std * np.exp(value):
-                found[deviation.name] = (excess, std * float(np.exp(value)))
-        return found
-
-    def _with_overloads(
-        self, alarms: list[Alarm], overloads: Mapping[str, tuple[float, float]], now: int
-    ) -> list[Alarm]:
-        """Opens an alarm for each body whose load is beyond its limits."""
-        opened = {alarm.parameter for alarm in alarms if alarm.kind == "load" and alarm.closed is None}
-        new = {f"{body}.load": beyond for body, beyond in overloads.items() if f"{body}.load" not in opened}
-        return alarms + [
-            self._overload(Alarm("load", name, now, now, "warning"), *beyond) for name, beyond in new.items()
-        ]
-
-    def _load_updated(self, alarm: Alarm, state: TrackerState, now: int) -> Alarm:
-        body = (alarm.parameter or "").removesuffix(".load")
-        found = self._overloads(state, 0.0).get(body)
-        return _closed(alarm, now) if found is None else self._overload(alarm, *found)
-
-    def _overload(self, alarm: Alarm, excess: float, std: float) -> Alarm:
-        peak = excess if abs(excess) > abs(alarm.peak or 0.0) else alarm.peak
-        return replace(alarm, change=excess, std=std, peak=peak)
-
     def _with_changes(self, alarms: list[Alarm], state: TrackerState, drift: Drift, now: int) -> list[Alarm]:
         """Opens alarms of parameters whose change test has fired."""
         alarmed = {alarm.parameter for alarm in alarms if alarm.closed is None and alarm.kind == "change"}
@@ -231,14 +181,14 @@ class Attribution:
         whole, members = replace(drift, change=drift.whole), self._of_kind(self.kinds[i])
         along = self._changed_with(i, whole, members)
         in_a_kind = any(name and "*" in name and fnmatchcase(self.names[i], name) for name in alarmed)
-        if in_a_kind and (along or _between(float(whole.change[i]), _common(whole, members)[0])):
+        if in_a_kind and (along or is_between(float(whole.change[i]), common_change(whole, members)[0])):
             return None
         since = int((state.changes.up_since if state.changes.active[i] > 0 else state.changes.down_since)[i])
         deviations = self._alternatives(i, state, drift, since, now)
         if deviations is None:
             return None
         if not in_a_kind and along and self._all_changed(whole, members):
-            name, (change, std) = f"*.{self.kinds[i]}", _common(whole, members)
+            name, (change, std) = f"*.{self.kinds[i]}", common_change(whole, members)
             others = self._masses_of(members.tolist(), whole)
         else:
             name, change, std = self.names[i], float(drift.change[i]), float(drift.std[i])
@@ -256,7 +206,7 @@ class Attribution:
         known = members[np.isfinite(drift.change[members])]
         if len(known) < self._rules.fewest:
             return False
-        middle, std = _common(drift, known)
+        middle, std = common_change(drift, known)
         with_it = np.array([self._changed_with(i, drift, known) for i in known])
         return bool(with_it.mean() >= self._rules.most_of and abs(middle) > max(self._common_limit, 4 * std))
 
@@ -275,7 +225,7 @@ class Attribution:
         return tuple(found)
 
     def _changed_with(self, i: int, drift: Drift, members: IntArray) -> bool:
-        middle, std = _common(drift, members)
+        middle, std = common_change(drift, members)
         distance = abs(drift.change[i] - middle)
         return bool(distance < max(self._rules.alike * abs(middle), 3 * float(np.hypot(drift.std[i], std))))
 
@@ -310,96 +260,6 @@ class Attribution:
                 found.append((abs(needed) / deviation.std, f"{deviation.name}.{deviation.kind}"))
         return tuple(name for _, name in sorted(found)[:3])
 
-    def _with_sensor(self, alarms: list[Alarm], jump: Jump, now: int) -> list[Alarm]:
-        """Opens the alarm of a gain or a delay that has jumped."""
-        name = self.sensor_name(jump.direction, jump.kind)
-        if any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):
-            return alarms
-        rivals = tuple(self.sensor_name(rival, self.model.kind_along(rival)) for rival in jump.rivals)
-        alarm = Alarm("sensor", name, jump.since, now, "warning", jump.size, jump.std, jump.size, alternatives=rivals)
-        return [*alarms, alarm]
-
-    def _drifted(self, state: TrackerState) -> list[MeasurementFault]:
-        """Gains and delays that have left the reference of the baseline by more than electronics drift."""
-        if not self.deviations:
-            return []
-        off, far = dev.drifted(state.calibration, self.model, state.belief)
-        return list(named(self.deviations, off, np.zeros(len(off)), far)) if far.any() else []
-
-    def _with_drifted(
-        self, alarms: list[Alarm], drifted: list[MeasurementFault], state: TrackerState, now: int
-    ) -> list[Alarm]:
-        """Opens alarms of gains and delays that drifted away, unless an open alarm contains them."""
-        reported = {
-            (channel, kind)
-            for a in alarms
-            if a.closed is None and a.kind == "sensor"
-            for names, _, kind in [(a.parameter or "").rpartition(".")]
-            for channel in names.split("|")
-        }
-        fresh = [f for f in drifted if not all((channel, f.kind) in reported for channel in f.channel.split("|"))]
-        return alarms + [
-            self._sensor_updated(Alarm("sensor", f"{f.channel}.{f.kind}", now, now, "warning"), state, now)
-            for f in fresh
-        ]
-
-    def sensor_name(self, direction: FloatArray, kind: str) -> str:
-        channels = [d.name for d, part in zip(self.deviations, direction, strict=True) if part]
-        return f"{'|'.join(channels)}.{kind}"
-
-    def _sensor_updated(self, alarm: Alarm, state: TrackerState, now: int) -> Alarm:
-        channel, _, kind = (alarm.parameter or "").rpartition(".")
-        if kind in HARD_FAULTS:
-            there = any(s.channel == channel and s.kind == kind for s in state.stuck)
-            return alarm if there else _closed(alarm, now)
-        members = [h for h, d in enumerate(self.deviations) if d.kind == kind and d.name in channel.split("|")]
-        if not members:
-            return _closed(alarm, now)
-        H = len(self.deviations)
-        away = state.belief.mean[-H:] - state.calibration.reference
-        others = ~np.isin(np.arange(H), members)
-        off = float(np.mean((away - self.model.common_value(away, others))[members]))
-        own = self.model.relative_std(state.belief.covariance[-H:, -H:])[members]
-        variance = dev.change_variance(state.calibration, self.model, state.belief)
-        known = float(np.sqrt(np.mean(own**2)))
-        spread = float(np.mean((variance + dev.pending_variance(state.calibration, self.model))[members]))
-        linear = float(dev.linearisation_std(np.asarray(off))) if kind == "gain" else 0.0
-        std = float(np.hypot(np.sqrt(spread), linear))
-        recovered = self._rules.sensor_recovered * abs(alarm.peak or 0.0)
-        if abs(off) + 2 * known < max(self.model.jump_limit(kind), recovered):
-            return _closed(replace(alarm, change=off, std=std), now)
-        peak = off if abs(off) > abs(alarm.peak or 0.0) else alarm.peak
-        return replace(alarm, change=off, std=std, peak=peak)
-
-    def _narrowed(self, alarms: list[Alarm], state: TrackerState, now: int) -> list[Alarm]:
-        """Alarms of several channels that share a gain or a delay without those that turn out not to have it: each
-        leaves an alarm when that would close if it were its own."""
-        out = list(alarms)
-        for i, alarm in enumerate(alarms):
-            channels, _, kind = (alarm.parameter or "").rpartition(".")
-            several = channels.split("|")
-            if alarm.kind != "sensor" or alarm.closed is not None or kind in HARD_FAULTS or len(several) < 2:
-                continue
-            own = [self._sensor_updated(replace(alarm, parameter=f"{name}.{kind}"), state, now) for name in several]
-            left = [name for name, one in zip(several, own, strict=True) if one.closed is None]
-            if not 0 < len(left) < len(several):
-                continue
-            out[i] = _closed(alarm, now)
-            name = f"{'|'.join(left)}.{kind}"
-            if not any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):
-                rivals = alarm.alternatives
-                fresh = Alarm("sensor", name, alarm.onset, now, "warning", peak=alarm.peak, alternatives=rivals)
-                out.append(self._sensor_updated(fresh, state, now))
-        return out
-
-    def _with_stuck(self, alarms: list[Alarm], state: TrackerState, now: int) -> list[Alarm]:
-        opened = {a.parameter for a in alarms if a.closed is None and a.kind == "sensor"}
-        return alarms + [
-            Alarm("sensor", f"{s.channel}.{s.kind}", s.since, now, "warning", s.value)
-            for s in state.stuck
-            if s.count >= self._rules.hard and f"{s.channel}.{s.kind}" not in opened
-        ]
-
     def _updated(self, alarm: Alarm, change: float, std: float) -> Alarm:
         """An active alarm with its change as it is now; severity falls only with hysteresis."""
         limit = self.settings.alarm_change
@@ -426,48 +286,3 @@ def _with_misfit(alarms: list[Alarm], state: TrackerState, now: int) -> list[Ala
     if state.misfit_since is None or any(a.kind == "misfit" and a.closed is None for a in alarms):
         return alarms
     return [*alarms, Alarm("misfit", None, state.misfit_since, now, "warning")]
-
-
-def _closed(alarm: Alarm, now: int) -> Alarm:
-    """Closed now, but not before it was opened: a wrong clock may have dated the opening later."""
-    return replace(alarm, closed=max(now, alarm.opened))
-
-
-def _common(drift: Drift, members: IntArray) -> tuple[float, float]:
-    """Median change of some parameters, and its standard deviation."""
-    change, std = drift.change[members], drift.std[members]
-    return float(np.nanmedian(change)), float(1.25 * np.sqrt(np.nanmean(std**2) / len(members)))
-
-
-def _between(change: float, common: float) -> bool:
-    """Whether a change lies between none and the common one: it follows that, or has not come along."""
-    return bool(0 <= change * np.sign(common) <= abs(common))
-
-
-def counted(
-    stuck: Sequence[Stuck],
-    found: Sequence[tuple[str, FaultKind, float]],
-    time: int,
-    most: int,
-    unseen: tuple[str, ...] | None = None,
-) -> tuple[Stuck, ...]:
-    """Counts of frozen, saturated, silent, noisy, reversed and exchanged channels after a window that found some.
-
-    unseen: parameters that the window did not identify; None: it could not be used.
-    """
-    old = {(s.channel, s.kind): s for s in stuck}
-    now: dict[tuple[str, FaultKind], float] = {
-        (channel, kind): value for channel, kind, value in found if kind in HARD_FAULTS
-    }
-    out = []
-    for key in dict.fromkeys([*old, *now]):
-        s = old.get(key) or Stuck(key[0], key[1], now[key], 0, time, unseen or ())
-        count = min(s.count + 1, most) if key in now else s.count - 1
-        if key in now and unseen is not None:
-            s = replace(s, unseen=tuple(name for name in s.unseen if name in unseen))
-        if count > 0:
-            value = now.get(key, s.value)
-            if s.kind == "noisy" and s.count:  # of one window it is not well known
-                value = float(np.sqrt(s.value**2 + (value**2 - s.value**2) / most))
-            out.append(replace(s, count=count, value=value))
-    return tuple(out)

@@ -18,11 +18,11 @@ from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import inflation, innovation
 from sprung.model.tracking import loads as loading
 from sprung.model.tracking import weather as weathers
-from sprung.model.tracking.alarms import Drift
 from sprung.model.tracking.cargo import Cargo
 from sprung.model.tracking.deviation_effects import DeviationEffects
 from sprung.model.tracking.deviation_model import DeviationModel
 from sprung.model.tracking.deviation_record import DeviationRecord
+from sprung.model.tracking.drift import Drift
 from sprung.model.tracking.jumps import Jump
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import TrackerState

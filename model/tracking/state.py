@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from binascii import b2a_base64
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from fnmatch import fnmatchcase
 from functools import cache
 from typing import Any, Literal
@@ -58,6 +58,10 @@ class Alarm:
     def key(self) -> tuple[str, str | None, int]:
         """What names an alarm for as long as it lives."""
         return self.kind, self.parameter, self.opened
+
+    def ended(self, now: int) -> Alarm:
+        """Closed now, but not before it was opened: a wrong clock may have dated the opening later."""
+        return replace(self, closed=max(now, self.opened))
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,12 +19,14 @@ from sprung.model.tracking import coverage, deviation_record, inflation, innovat
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import weather as weathers
-from sprung.model.tracking.alarms import Attribution, LoadLimit, counted
+from sprung.model.tracking.alarms import VehicleAlarms
 from sprung.model.tracking.deviation_model import model_of as deviation_model
 from sprung.model.tracking.fusion import KNOWN, Fusion, nanoseconds
 from sprung.model.tracking.jumps import Jump
+from sprung.model.tracking.load_alarms import LoadLimit
 from sprung.model.tracking.loads import STOPPED
 from sprung.model.tracking.reports import ParameterLike, ParameterReport, health_of, reported
+from sprung.model.tracking.sensor_alarms import counted
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
 from sprung.model.tracking.state import Alarm, Health, Stuck, TrackerState, TrackerStateError
 from sprung.model.tracking.weather import WeatherModel
@@ -82,7 +84,7 @@ class Tracker:
             np.zeros(len(self.names)),
             np.zeros((self.model.size, self.model.size)),
         )
-        self._attribution = Attribution(
+        self._alarms = VehicleAlarms(
             self.names, self.settings, self.deviations, self.model, self.weather, dict(limits), dict(masses)
         )
         self._fusion = Fusion(self.settings, self.model, self.weather)
@@ -137,7 +139,7 @@ class Tracker:
         seen = coverage.update(state.coverage, usable=new.used > state.used)
         new = replace(new, time=time_ns, stuck=self._stuck(state, estimate, centre), coverage=seen)
         jump = jump if self._fusion.armed(state) else None
-        return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), jump, centre))
+        return replace(new, alarms=self._alarms.updated(new, self._fusion.drift(new), jump, centre))
 
     def _fused(
         self, state: TrackerState, estimate: Estimate, time_ns: int, centre: int, conditions: Conditions | None
@@ -189,7 +191,7 @@ class Tracker:
         if estimate.informative or not estimate.faults:
             return new
         new = replace(new, stuck=self._stuck(state, estimate, centre))
-        return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), None, centre))
+        return replace(new, alarms=self._alarms.updated(new, self._fusion.drift(new), None, centre))
 
     def upgraded(self, state: TrackerState) -> TrackerState:
         """The state with everything that this tracker follows: older formats lack weather, pressures, body constants.
@@ -270,7 +272,7 @@ class Tracker:
         new = replace(state, changes=change_test.relearn(state.changes, rows))
         if new.weather is not None:
             new = replace(new, weather=weathers.reset_offsets(new.weather, self.weather, rows))
-        return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), None, state.time or 0))
+        return replace(new, alarms=self._alarms.updated(new, self._fusion.drift(new), None, state.time or 0))
 
     def posterior(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the log-ratios to nominal, each of shape (P,)."""

@@ -16,7 +16,7 @@ from sprung.model.identification.measurements.deviations import deviations
 from sprung.model.identifier import Identifies
 from sprung.model.signals import Estimate, FloatArray, MeasurementFault
 from sprung.model.system import MANCHESTER, System, load_system
-from sprung.model.tracking.alarms import LoadLimit
+from sprung.model.tracking.load_alarms import LoadLimit
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
 from sprung.service.can_database import database_of
 from sprung.service.errors import UserError

@@ -8,7 +8,7 @@ import pytest
 from sprung.model.identification.measurements.deviations import Deviation
 from sprung.model.signals import Conditions, Deviating
 from sprung.model.system import parse_system
-from sprung.model.tracking.alarms import LoadLimit
+from sprung.model.tracking.load_alarms import LoadLimit
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 from tests.tracker_windows import EPOCH, TrackedParameter, correlated, estimate
 

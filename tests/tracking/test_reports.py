@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sprung.model.tracking.alarms import Drift
 from sprung.model.tracking.coverage import Coverage
+from sprung.model.tracking.drift import Drift
 from sprung.model.tracking.reports import health_of, reported
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, TrackerState

@@ -85,7 +85,7 @@ def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor() -> 
         belief = replace(state.belief, mean=mean)
         asked = replace(state, changes=changed, calibration=calibration, belief=belief)
         drift = tracker._fusion.drift(asked)
-        return [a.kind for a in tracker._attribution.updated(asked, drift, None, at)]
+        return [a.kind for a in tracker._alarms.updated(asked, drift, None, at)]
 
     quiet = np.zeros(len(tracker.model.directions))
     rising = quiet.copy()

@@ -140,7 +140,7 @@ def test_a_damper_that_is_still_followed_to_the_common_change_has_no_alarm_of_it
         late = replace(
             state, belief=replace(state.belief, mean=mean.copy()), changes=replace(state.changes, active=active)
         )
-        alarms = follow._attribution.updated(late, follow._fusion.drift(late), None, state.time or 0)
+        alarms = follow._alarms.updated(late, follow._fusion.drift(late), None, state.time or 0)
         assert [alarm.parameter for alarm in alarms if alarm.closed is None] == ["*.damping", *alone]
 
 
