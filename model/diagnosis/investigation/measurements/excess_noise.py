@@ -86,7 +86,8 @@ def outliers(
 ) -> list[NoiseFault]:
     """Outliers among ratios (N,) of noise to declared noise, each by the others' median; fewer than two say nothing.
 
-    white (N,): whether it is noise that counts: that of a sensor goes on above the compared band.  count: bins that inform on it.
+    white (N,): whether it is noise that counts; that of a sensor goes on above the compared band.
+    count: bins that inform on it.
     """
     found = []
     for i, name in enumerate(names):
