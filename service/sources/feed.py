@@ -120,69 +120,85 @@ def feed_file(
         path, pipeline.engine.system, pipeline.engine.dbc, 1 if speed else batch_windows, speed, start
     )
     reading = reading_of(request, limits)
-    take: Insist[Any] = partial(insist, what=file_name or path.name, check=check) if insistent else _at_once
     started = time.perf_counter()
     fed = FeedResult("", ride=comfort.RideQuality(pipeline.engine.system))
-
-    def name(recorded: str | None) -> str:
-        return fed.vehicle or vehicle_of(vehicle, recorded, file_name or path.name)
-
-    priority = Priority.LIVE if speed else Priority.BATCH
-
-    def refuse(piece: ReadWindows) -> None:
-        other = take(partial(_other_ride, pipeline, fed.vehicle, piece, recording_id))
-        if other is not None:
-            raise UserError(
-                f"{path}: its times count from 0, and from {to_iso(piece.windows[0].start)} on, as the file's own time "
-                f"has it, there is {other} of {fed.vehicle} already; say when it began (`sprung replay --start`, "
-                "`start` beside an uploaded file)"
-            )
-
-    def identify(windows: list[Window]) -> IdentifiedBatch:
-        identified: IdentifiedBatch = take(partial(pipeline.identify, fed.vehicle, windows, priority))
-        return identified
-
-    found = prefetched(_identified(pipeline, fed, reading, name, identify, check, refuse), 1, check)
+    feed = _FileFeed(
+        pipeline,
+        fed,
+        path,
+        given_name=vehicle,
+        file_name=file_name or path.name,
+        recording_id=recording_id,
+        priority=Priority.LIVE if speed else Priority.BATCH,
+        take=partial(insist, what=file_name or path.name, check=check) if insistent else _at_once,
+    )
+    found = prefetched(feed.identified(reading, check), 1, check)
     try:
         for one, tally in found:
             on_tally(tally)
             if one is not None:
-                on_batch(_count(fed, take(partial(pipeline.keep, one(), recording_id))))
+                on_batch(_count(fed, feed.take(partial(pipeline.keep, one(), recording_id))))
     finally:
         reading.close()
         found.close()
     on_tally(reading.ending.tally)
-    fed.vehicle = name(reading.ending.vehicle)
-    fed.state = fed.state or take(partial(pipeline.state, fed.vehicle))
+    fed.vehicle = feed.vehicle_of(reading.ending.vehicle)
+    fed.state = fed.state or feed.take(partial(pipeline.state, fed.vehicle))
     _ended(fed, reading.ending)
     fed.wall_seconds = time.perf_counter() - started
     return fed
 
 
-def _identified(
-    pipeline: Pipeline,
-    fed: FeedResult,
-    reading: Reading,
-    name: Callable[[str | None], str],
-    identify: Callable[[list[Window]], IdentifiedBatch],
-    check: Callable[[], None],
-    refuse: Callable[[ReadWindows], None],
-) -> Iterator[tuple[Callable[[], IdentifiedBatch] | None, Tally]]:
-    """Windows as they are read, identified ahead where that is of use, with the tally until there; the ride's comfort
-    is kept beside them."""
-    for piece in reading.pieces(check):
-        found: Callable[[], IdentifiedBatch] | None = None
-        if piece.windows:
-            fed.vehicle = name(piece.vehicle)
-            if piece.assumed:
-                refuse(piece)
-            for window in piece.windows:
-                if window.outcome != "dropped" and fed.ride is not None:
-                    fed.ride.push(window.start, window.values)
-            found = partial(identify, piece.windows)
-            if not pipeline.knows_faults(fed.vehicle):
-                found = partial(_itself, found())
-        yield found, piece.tally
+@dataclass(frozen=True, slots=True)
+class _FileFeed:
+    """One recording on its way through the pipeline."""
+
+    pipeline: Pipeline
+    fed: FeedResult
+    path: Path
+    given_name: str | None  # of the vehicle, by the user
+    file_name: str
+    recording_id: str | None
+    priority: Priority
+    take: Insist[Any]  # does what needs the store, again and again if the feed is insistent
+
+    def vehicle_of(self, recorded: str | None) -> str:
+        """The vehicle's name; recorded: as the recording has it."""
+        return self.fed.vehicle or vehicle_of(self.given_name, recorded, self.file_name)
+
+    def identified(
+        self, reading: Reading, check: Callable[[], None]
+    ) -> Iterator[tuple[Callable[[], IdentifiedBatch] | None, Tally]]:
+        """Windows as they are read, identified ahead where that is of use, with the tally until there; the ride's
+        comfort is kept beside them."""
+        fed = self.fed
+        for piece in reading.pieces(check):
+            found: Callable[[], IdentifiedBatch] | None = None
+            if piece.windows:
+                fed.vehicle = self.vehicle_of(piece.vehicle)
+                if piece.assumed:
+                    self._refuse_another_ride(piece)
+                for window in piece.windows:
+                    if window.outcome != "dropped" and fed.ride is not None:
+                        fed.ride.push(window.start, window.values)
+                found = partial(self._identify, piece.windows)
+                if not self.pipeline.knows_faults(fed.vehicle):
+                    found = partial(_itself, found())
+            yield found, piece.tally
+
+    def _identify(self, windows: list[Window]) -> IdentifiedBatch:
+        found: IdentifiedBatch = self.take(partial(self.pipeline.identify, self.fed.vehicle, windows, self.priority))
+        return found
+
+    def _refuse_another_ride(self, piece: ReadWindows) -> None:
+        """Raises UserError where another recording of the vehicle lies at the times that are assumed for a piece."""
+        other = self.take(partial(_other_ride, self.pipeline, self.fed.vehicle, piece, self.recording_id))
+        if other is not None:
+            raise UserError(
+                f"{self.path}: its times count from 0, and from {to_iso(piece.windows[0].start)} on, as the file's own "
+                f"time has it, there is {other} of {self.fed.vehicle} already; say when it began (`sprung replay "
+                "--start`, `start` beside an uploaded file)"
+            )
 
 
 def _other_ride(pipeline: Pipeline, vehicle: str, piece: ReadWindows, recording_id: str | None) -> str | None:
