@@ -102,8 +102,8 @@ def _along_what_was_seen(
     """The outcome with laws acting along the motion that the sensors saw; the simulated one where that is no better.
 
     A law that shifts the frequency makes a linear start diverge within a few periods, and hard stops between bodies
-    make a simulation under a measured force leave the recording.  With forces that nobody measured on every other body,
-    as strong as they have to be, the fit is one of forces along the measured motion.
+    make a simulation under a measured force leave the recording.  With an unmeasured force on every other body, as
+    strong as it has to be, forces are fitted along the measured motion.
     """
     pushed, inputs = with_disturbances(system), len(system.inputs)
     nothing = np.zeros((len(record.values), len(pushed.inputs) - inputs))

@@ -42,7 +42,7 @@ class EquationSite:
 
 def sites(system: System) -> list[EquationSite]:
     """The laws of a whole system's elements, part by part, with formulas.  Errors: `ExchangeError` for laws that no
-    formula describes, forces and movements that nobody measures among them."""
+    formula describes, unmeasured forces and movements included."""
     found = []
     for placed in system.laws:
         law = placed.law

@@ -178,7 +178,7 @@ class Identifier:
         moved: BoolArray,
     ) -> tuple[dict[int, FaultExplanation], BoolArray]:
         """Windows, by index, with the faults that their vehicle had before or with redundant channels that contradict
-        each other, put right; and which windows contain such a contradiction, (B,).  moved: by their inputs, (B,)."""
+        each other, corrected; and which windows contain such a contradiction, (B,).  moved: by their inputs, (B,)."""
         explained = explainer.from_known_faults(windows, {b: its for b, its in enumerate(known) if its and moved[b]})
         contradicted = moved & explainer.contradictions.contradicted(windows)
         explained |= explainer.from_contradictions(windows, unexplained(np.flatnonzero(contradicted), explained))
@@ -224,7 +224,7 @@ class Identifier:
         return self._estimates(refined, False, points)
 
     def _restored(self, cause: FaultExplanation) -> Estimate:
-        """The estimate of a window whose measurements were put right."""
+        """The estimate of a window whose measurements were corrected."""
         (restored,) = self._estimates(cause.refined, False, cause.point[None])
         fitting, known = restored.adequate and cause.corrected, restored.identified or bool(cause.faults)
         return replace(self._averaged(restored), faults=cause.faults, adequate=fitting, identified=known)

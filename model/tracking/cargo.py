@@ -44,8 +44,8 @@ def start(prior_variance: FloatArray) -> Cargo:
     """Nothing seen yet; variances (L,) of the loads' logarithms before any window."""
     zero = np.zeros(len(prior_variance))
     never = np.zeros(len(zero), dtype=np.int64)
-    nobody = np.zeros(1, dtype=np.int64)
-    return Cargo(zero, zero + UNKNOWN, zero + np.nan, zero, prior_variance, zero, zero, zero, never, nobody)
+    undisputed = np.zeros(1, dtype=np.int64)
+    return Cargo(zero, zero + UNKNOWN, zero + np.nan, zero, prior_variance, zero, zero, zero, never, undisputed)
 
 
 def remembered(cargo: Cargo, load: FloatArray, variance: FloatArray, known: BoolArray, at: int) -> Cargo:

@@ -247,7 +247,7 @@ class Fusion:
     ) -> tuple[bool, TrackerState]:
         """Whether a window contradicts the believed loads and is passed over, and the state with that noted.
 
-        What lasts for a moment is no load but a force that nobody measures, as where a curve begins or ends.
+        What lasts for a moment is no load but an unmeasured force, as where a curve begins or ends.
         """
         cargo = state.cargo
         if cargo is None or not len(self.model.loads_at):

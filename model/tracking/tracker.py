@@ -322,7 +322,7 @@ class Tracker:
         return tuple(MeasurementFault(s.channel, s.kind, s.value) for s in reported)
 
     def known_faults(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
-        """What identification should put right before it looks at a window: hard faults, gains and large delays.
+        """What identification should correct before it looks at a window: hard faults, gains and large delays.
 
         The evidence of windows is linear in gains and delays near those that were taken back; far from them it must be
         refined once more, which costs several times as much.

@@ -111,7 +111,7 @@ def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
         if _still_rejected(state, before.fit) or another_structure(state):
             break  # further findings would only imitate another structure
         if common_delay(state) is not None:
-            break  # it is put right before anything else is sought
+            break  # it is corrected before anything else is sought
     return state
 
 

@@ -28,7 +28,7 @@ _NO_FURTHER = 0.25  # odds assumed that a finding is the last
 
 
 def share_done(findings: float) -> float:
-    """Share of an investigation that is done once so many findings are made, of a number that nobody knows."""
+    """Share of an investigation that is done once so many findings are made, of an unknown number."""
     return _SOUGHT - (_SOUGHT - _BEGUN) * float((1 - _NO_FURTHER) ** findings)
 
 

@@ -83,7 +83,7 @@ class Noise:
 
     @property
     def process_noise(self) -> bool:
-        """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
+        """Whether laws act along the motion that the sensors saw: a measured force may not be the whole one."""
         return len(self.force) > 0
 
     def support_variance(self, omega: FloatArray) -> FloatArray:

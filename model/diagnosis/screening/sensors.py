@@ -84,7 +84,7 @@ def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Ca
     pushed = problem.driving(fit.forward)
     for i, name in enumerate(names):
         if not np.any(part.force[:, i]):
-            continue  # zero throughout: nobody measured it
+            continue  # zero throughout: it was not measured
         direction = plant.structure.F[:, i]
         load = np.zeros((part.force_polynomial.shape[0], len(direction)))
         load[0] = -direction

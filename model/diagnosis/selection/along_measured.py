@@ -27,7 +27,7 @@ _STEPS, _ROUNDS = 8, 5  # of a fit along the measured motion, and how often it g
 SHARPENED = 20  # steps of a simulation, in which a blunt corner becomes sharp
 _BLUNT, _LESS_BLUNT = 0.25, 0.1  # of the rms rate, widths of corners from which a simulation's fit sharpens them
 _SHARP = 0.01  # the same along the measured motion, which corners do not change
-_DISTURBANCE = "disturbance of "  # and a body: name of a force that nobody measured
+_DISTURBANCE = "disturbance of "  # and a body: name of an unmeasured force
 _PER_MASS = 1.0  # m/s^2, first level of the unmeasured forces over the masses they act on
 
 
@@ -181,9 +181,9 @@ def _ending(point: Point, term: Term) -> Point:
 
 
 def with_disturbances(system: System) -> System:
-    """A system with a force input, for what nobody measured, on every body whose force is not measured."""
-    nobody = {"kind": "force", "gain_std": 0.0, "offset_std": 0.0}  # there is no instrument that may err
-    forces = {_DISTURBANCE + body: ForceInput.model_validate(nobody | {"body": body}) for body in unpushed(system)}
+    """A system with a force input, for unmeasured forces, on every body whose force is not measured."""
+    exact = {"kind": "force", "gain_std": 0.0, "offset_std": 0.0}  # there is no instrument that may err
+    forces = {_DISTURBANCE + body: ForceInput.model_validate(exact | {"body": body}) for body in unpushed(system)}
     return replace(system, file=system.file.model_copy(update={"inputs": {**system.file.inputs, **forces}}))
 
 
@@ -194,5 +194,5 @@ def unpushed(system: System) -> list[str]:
 
 
 def disturbed(system: System) -> set[str]:
-    """Bodies of a system under a force that nobody measured."""
+    """Bodies of a system under an unmeasured force."""
     return {name.removeprefix(_DISTURBANCE) for name in system.file.inputs if name.startswith(_DISTURBANCE)}

@@ -60,7 +60,7 @@ class Explainer:
     def from_known_faults(self, windows: FloatArray, known: Mapping[int, Faults]) -> dict[int, FaultExplanation]:
         """Explanations of windows of a batch (B, T, C) by the faults that earlier windows of their vehicles had.
 
-        known: these faults, by window.  A window that does not show them, or does not fit with them put right, is left
+        known: these faults, by window.  A window that does not show them, or does not fit with them corrected, is left
         out: what is wrong with it must be looked for anew.
         """
         found: dict[int, FaultExplanation] = {}
@@ -228,7 +228,7 @@ class Explainer:
         C, point, before = self.channels, cause.point.copy(), before.copy()
         for fault in cause.faults:
             columns = [self.names.index(name) for name in fault.channel.split("|")]
-            if fault.kind == "swapped" and len(columns) == 2:  # columns were put right, then exchanged
+            if fault.kind == "swapped" and len(columns) == 2:  # columns were corrected, then exchanged
                 for part in (before[:C], before[C : 2 * C]):
                     part[columns] = part[columns[::-1]]
         more = np.abs(cause.point) > 0

@@ -30,7 +30,7 @@ class NominalTrials:
         self._restorer, self._rearrangements = restorer, rearrangements
 
     def rearranged(self, window: FloatArray) -> FaultExplanation | None:
-        """One window (T, C) with a reversed or two exchanged channels put right; None: it does not fit then."""
+        """One window (T, C) with a reversed or two exchanged channels corrected; None: it does not fit then."""
         names = self._restorer.names
         restored = np.array([window, *(one.undone(window) for one in self._rearrangements)])
         costs = nominal_cost(self._restorer.refiner(self._restorer.samples), restored)
@@ -42,7 +42,7 @@ class NominalTrials:
         return None
 
     def late(self, window: FloatArray, *, far: bool) -> FaultExplanation | None:
-        """One window (T, C) with a channel, or all of a clock, that is late or early by many samples put right.
+        """One window (T, C) with a channel, or all of a clock, that is late or early by many samples corrected.
 
         far: clocks by very many, too.  None: it does not fit then.
         """

@@ -1,4 +1,4 @@
-"""Windows refined with what is wrong put right: deviations taken back one by one, channels left out.
+"""Windows refined with their faults corrected: deviations taken back one by one, channels left out.
 
 A gain, a delay or a load leaves a trace of its own in the residual (`measurements.calibration`).  The one with the most
 evidence is taken back from the samples, and the window is refined again, until it fits or nothing helps.
@@ -27,7 +27,7 @@ Step = Callable[[FloatArray, FloatArray], FloatArray]  # from score (H,) and inf
 
 
 class Restorer:
-    """Refines windows of one system and length with faults of their measurements put right."""
+    """Refines windows of one system and length with faults of their measurements corrected."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class Restorer:
         """Those of some windows (B, T, C), by index, that fit once deviations are taken back.
 
         One deviation at a time, the one with the most evidence, or what `step` makes of score and information.
-        known: faults that were put right before, of each window; start: deviations (H,) to begin with.
+        known: faults that were corrected before, of each window; start: deviations (H,) to begin with.
         """
         found: dict[int, FaultExplanation] = {}
         active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.corrections.deviations)))

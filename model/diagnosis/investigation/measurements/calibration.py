@@ -338,8 +338,8 @@ def _of_all_bodies(state: Investigation) -> Iterator[Term]:
 def _of_bodies(state: Investigation, law: Law) -> Iterator[Term]:
     """Changes of the quantity of bodies that a law scales, where the system file does not estimate it.
 
-    Without a measured force, the heaviest body's is kept: masses are then known up to a common factor only.  Beside a
-    force that nobody measured no mass is known better than before: that force makes up for it.
+    Without a measured force, the heaviest body's is kept: masses are then known up to a common factor only.  Beside an
+    unmeasured force no mass is known better than before: that force makes up for it.
     """
     system, rules = state.problem.system, state.options.rules.plausible
     known = {p.name.removesuffix(f".{law.scales}") for p in system.parameters}
