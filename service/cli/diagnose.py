@@ -115,10 +115,11 @@ def text(report: Report) -> str:
             lines.append(sentence)
         if finding.advice:
             lines.append(f"  {finding.advice}")
+    left, noise = report.augmented_validation.nrmse, report.noise_floor.nrmse
     lines.append(
         f"error on samples that no fit saw: {100 * report.baseline_validation.nrmse:.1f} % before, "
-        f"{100 * report.augmented_validation.nrmse:.1f} % with the findings, "
-        f"{100 * report.noise_floor.nrmse:.1f} % is noise"
+        f"{100 * left:.1f} % with the findings, "
+        + (f"{100 * noise:.1f} % is noise" if noise <= 1.05 * left else f"no more than noise ({100 * noise:.1f} %)")
     )
     used = [report.recording.used] if report.recording.used else []
     return "\n".join([*lines, *used, *report.changes, *report.advice]).replace("+-", "±")

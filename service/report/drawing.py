@@ -82,12 +82,15 @@ def _support(axes: Axes, layout: Layout, name: str, colour: str) -> Point:
     )
     centre = layout.at(x, y, -0.42)
     order = -2 if y > 0 else 9
-    if not layout.railway:  # the moved table of a test rig
-        table = [(centre[0] - 0.6, 0.0), (centre[0] + 0.6, 0.0), (centre[0] + 0.6, -0.22), (centre[0] - 0.6, -0.22)]
+    if not layout.railway or name in layout.raised:  # the moved table or crosshead of a test rig
+        face = layout.bottom(name)
+        away = 1.0 if name in layout.raised else -1.0  # from the element
+        across, back = centre[0], face + 0.22 * away
+        table = [(across - 0.6, face), (across + 0.6, face), (across + 0.6, back), (across - 0.6, back)]
         axes.add_patch(Polygon(table, closed=True, facecolor="#f4f6f8", edgecolor=colour, lw=1.5, zorder=order))
         arrow = {"arrowstyle": "<|-|>", "color": colour, "lw": 1.3}
-        axes.annotate("", xy=(centre[0], -0.24), xytext=(centre[0], -0.84), arrowprops=arrow)
-        return centre
+        axes.annotate("", xy=(across, face + 0.24 * away), xytext=(across, face + 0.84 * away), arrowprops=arrow)
+        return across, back
     axes.add_patch(Circle(centre, 0.42, facecolor="#f4f6f8", edgecolor=colour, lw=1.5, zorder=order))
     axes.add_patch(Circle(centre, 0.08, facecolor=colour, edgecolor="none", zorder=order))
     return centre
@@ -191,7 +194,8 @@ def _ground(axes: Axes, layout: Layout) -> None:
         x, y = layout.element_position(name)
         if item.lower not in file.bodies or item.upper not in file.bodies:
             rails.setdefault(y, []).append(x)
-    on_wheels = any(not isinstance(source, ForceInput) for source in file.inputs.values())
+    supports = {name for name, source in file.inputs.items() if not isinstance(source, ForceInput)}
+    on_wheels = bool(supports - layout.raised)
     for y, along in rails.items():
         height = -0.84 if on_wheels else 0.0
         start, end = layout.at(min(along) - 1.2, y, height), layout.at(max(along) + 1.2, y, height)

@@ -67,12 +67,18 @@ def bare(axes: Axes) -> None:
 
 
 def engineering(value: float, digits: int = 3) -> str:
-    """1.22e6 as "1.22 M", 395 as "395"; for numbers beside a unit."""
-    size = abs(value)
-    for scale, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ")):
+    """1.22e6 as "1.22 M", 395 as "395", 0.23 as it is; for numbers beside a unit."""
+    rounded = float(f"{value:.{digits}g}")  # before it is printed, which then needs no exponent
+    size = abs(rounded)
+    for scale, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if size >= scale:
-            return f"{value / scale:.{digits}g} {prefix}".rstrip()
-    return f"{value:.{digits}g}"
+            return f"{rounded / scale:.6g} {prefix}"
+    if size >= 0.01 or size == 0:
+        return f"{rounded:.6g}"
+    for scale, prefix in ((1e-3, "m"), (1e-6, "µ")):
+        if size >= scale:
+            return f"{rounded / scale:.6g} {prefix}"
+    return f"{rounded:.{digits}g}"
 
 
 def excerpt(error: FloatArray, samples: int) -> slice:

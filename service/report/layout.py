@@ -19,7 +19,8 @@ class Layout:
     """Where everything stands: levels count the storeys from the ground up."""
 
     system: System
-    level: Mapping[str, int]
+    level: Mapping[str, int]  # of the bodies
+    raised: frozenset[str]  # supports at the upper end of an element that stands on the ground or on another support
     half_length: Mapping[str, float]  # m, of each body along x
     slant: float  # sideways shift per metre of y
     rise: float
@@ -29,11 +30,11 @@ class Layout:
         return x + self.slant * y, height + self.rise * y
 
     def bottom(self, name: str) -> float:
-        """Drawn height of the underside of a body, 0 for the ground and supports."""
-        return STOREY * self.level[name] if name in self.level else 0.0
+        """Drawn height of the underside of a body, 0 for the ground and supports that are not raised."""
+        return STOREY if name in self.raised else STOREY * self.level[name] if name in self.level else 0.0
 
     def top(self, name: str) -> float:
-        return self.bottom(name) + THICKNESS if name in self.level else 0.0
+        return self.bottom(name) + THICKNESS if name in self.level else self.bottom(name)
 
     def element_position(self, element: str) -> Point:
         """(x, y) of an element; the body's own position where the file gives none."""
@@ -75,4 +76,6 @@ def lay_out(system: System) -> Layout:
         ]
         reach[name] = 1.25 * max(away, default=0.0) + 0.35
     single = all(item.position is None for item in file.elements.values())
-    return Layout(system, level, reach, 0.0 if single else 0.62, 0.0 if single else 0.34)
+    carried = [(item.upper, item.lower) for item in file.elements.values() if not {item.upper, item.lower} & set(level)]
+    raised = frozenset(upper if upper in file.inputs else lower for upper, lower in carried)
+    return Layout(system, level, raised, reach, 0.0 if single else 0.62, 0.0 if single else 0.34)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from sprung.model.diagnosis.report.report import Report
+from sprung.model.diagnosis.report.report import Finding, Report
 from sprung.model.system import System
 from sprung.service.report import drawing, forces, ink, signals, values, words
 from sprung.service.report.page import render
@@ -23,9 +24,17 @@ class ReportFiles:
     pictures: dict[str, Path]
 
 
+def findings_by_place(findings: Sequence[Finding], laws: words.Laws) -> dict[str, str]:
+    """What stands beside every located place; several findings of one place share its label."""
+    places = dict[str, list[str]]()
+    for found in findings:
+        places.setdefault(found.location, []).append(words.finding_words(found, laws))
+    return {place: "; ".join(said) for place, said in places.items()}
+
+
 def draw_pictures(report: Report, system: System, folder: Path) -> dict[str, Path]:
     """Every picture for which the report has the arrays, as PNG files in `folder`."""
-    findings = {f.location: words.finding_words(f, system.catalogue) for f in report.findings}
+    findings = findings_by_place(report.findings, system.catalogue)
     units = {channel.name: channel.unit for channel in system.channels}
     figures: dict[str, Figure | None] = {
         "system": drawing.draw_system(system, findings, report.localization),

@@ -38,6 +38,8 @@ from sprung.model.laws.hysteresis import SERIES_STIFFNESS
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
+DRAWN_CYCLES = 6  # of a law's loop
+
 
 def compose_components(
     system: System, record: Recorded, options: Options, judged: Sequence[JudgedComponent], judgement: ComponentJudgement
@@ -184,10 +186,21 @@ def _arrays(judged: Sequence[JudgedComponent]) -> dict[str, np.ndarray]:
         arrays[f"{key}.rate"] = task.motion.rate[thin]
         arrays[f"{key}.force_before"] = one.base.residual[thin]
         arrays[f"{key}.force_after"] = one.final.residual[thin]
-        arrays[f"{key}.loop_x"], arrays[f"{key}.loop_y"] = task.motion.deflection[thin], law[thin]
+        cycles = largest_cycles(task.motion.deflection, task.motion.rate)
+        arrays[f"{key}.loop_x"], arrays[f"{key}.loop_y"] = task.motion.deflection[cycles], law[cycles]
         arrays[f"{key}.total_measured"] = task.force[thin]
         arrays[f"{key}.total_modelled"] = one.final.force[thin]
     return arrays
+
+
+def largest_cycles(deflection: np.ndarray, rate: np.ndarray) -> slice:
+    """The samples (T,) of the few cycles about the largest deflection: hundreds of loops are a stain."""
+    turns = np.flatnonzero(np.diff(np.sign(rate)))
+    if len(turns) <= 2 * DRAWN_CYCLES:
+        return slice(None)
+    largest = int(np.searchsorted(turns, np.argmax(np.abs(deflection))))
+    first = min(max(largest - DRAWN_CYCLES, 0), len(turns) - 2 * DRAWN_CYCLES - 1)
+    return slice(int(turns[first]), int(turns[first + 2 * DRAWN_CYCLES]) + 1)
 
 
 def _columns_of_findings(one: JudgedComponent) -> list[slice]:

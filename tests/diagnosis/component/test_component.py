@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import butter, sosfiltfilt
 
 from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
+from sprung.model.diagnosis.component.compose import DRAWN_CYCLES, largest_cycles
 from sprung.model.diagnosis.force.motion import element_motion, noise_at_rest, still_stretches
 from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.laws import CATALOGUE, Law
@@ -397,3 +398,13 @@ def test_a_motion_measured_by_acceleration_alone_is_integrated() -> None:
     assert values["damper.stiffness"] == pytest.approx(K, rel=0.02)
     assert values["damper.damping"] == pytest.approx(C, rel=0.02)
     assert any("integrated from its acceleration" in note for note in found.advice)
+
+
+def test_a_loop_is_drawn_of_the_few_largest_cycles() -> None:
+    time = np.arange(0, 60, 0.01)
+    size = np.exp(-(((time - 40) / 5) ** 2))
+    deflection, rate = size * np.sin(2 * np.pi * time), size * 2 * np.pi * np.cos(2 * np.pi * time)
+    drawn = largest_cycles(deflection, rate)
+    assert drawn.stop - drawn.start == pytest.approx(100 * DRAWN_CYCLES, abs=2)
+    assert abs(time[drawn].mean() - 40) < 1 and np.argmax(np.abs(deflection)) in range(drawn.start, drawn.stop)
+    assert largest_cycles(deflection[:300], rate[:300]) == slice(None)

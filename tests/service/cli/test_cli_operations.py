@@ -162,6 +162,14 @@ def test_a_finding_is_told_once_unless_advice_hangs_on_it() -> None:
     assert [told[i - 1][:1] for i, line in enumerate(told) if line == "  look"] == ["a", "b"]
 
 
+@pytest.mark.parametrize(("left", "said"), [(0.031, "3.0 % is noise"), (0.021, "no more than noise (3.0 %)")])
+def test_noise_is_not_said_to_be_more_than_all_that_is_left(left: float, said: str) -> None:
+    report = friction_report()
+    after = replace(report.augmented_validation, nrmse=left)
+    floor = replace(report.noise_floor, nrmse=0.03)
+    assert text_of(replace(report, augmented_validation=after, noise_floor=floor)).splitlines()[-1].endswith(said)
+
+
 def test_a_load_that_is_none_has_no_minus() -> None:
     assert measurement_lines({"load": {"car": [-0.3, 9.0]}}, {}) == ["load: car +0 ± 9 kg against nominal"]
     assert percent(-0.0001) == "+0.0 %"

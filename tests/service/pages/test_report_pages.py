@@ -13,12 +13,12 @@ import pytest
 from sprung.model.diagnosis.report.report import (
     LawParameter,
 )
-from sprung.model.system import load_system
+from sprung.model.system import load_system, parse_system
 from sprung.service.report import words
 from sprung.service.report.drawing import draw_system
 from sprung.service.report.layout import lay_out
 from sprung.service.report.values import largest_bias
-from sprung.service.report.writing import write_report
+from sprung.service.report.writing import findings_by_place, write_report
 from tests.report_made import SYSTEM, friction_report
 
 
@@ -110,6 +110,52 @@ def test_the_drawing_of_a_narrow_rig_is_no_wider_than_it_needs_to_be() -> None:
     width, height = plain.get_size_inches()
     assert width < 0.7 * height  # half of a phone's screen, not the middle of a page that is wider than it
     assert width < found.get_size_inches()[0] < draw_system(SYSTEM, {}, {}).get_size_inches()[0]
+
+
+def test_a_component_on_a_test_bench_hangs_from_what_moves_it() -> None:
+    rig = parse_system(
+        """
+name: bench
+sample_rate: 200
+window: 200
+bodies: {}
+inputs:
+  rod: {kind: support, displacement: {column: Weg, noise: 2.0e-6}}
+elements:
+  damper: {upper: rod, lower: ground, stiffness: 1.0e+3, damping: 1.5e+3}
+sensors:
+  cell: {kind: force, element: damper, column: Kraft, noise: 2.0}
+"""
+    )
+    layout = lay_out(rig)
+    assert layout.bottom("rod") == layout.top("rod") > layout.top("ground") == 0.0
+    (axes,) = draw_system(rig, {"damper": "dry friction of 90 N; static preload of 117 N"}, {}).axes
+    drawn = np.concatenate([line.get_ydata() for line in axes.lines if len(line.get_ydata()) == 13])  # the spring's
+    assert drawn.min() == 0.0 and drawn.max() == layout.bottom("rod")
+    assert "dry friction of 90 N" in axes.texts[-1].get_text() and "preload" in axes.texts[-1].get_text()
+
+
+def test_all_findings_of_a_place_share_its_label() -> None:
+    found = friction_report().findings[0]
+    other = replace(found, effect="preload", parameters=(LawParameter("force", 117.0, 0.2, "N"),))
+    words_at = findings_by_place([found, other], SYSTEM.catalogue)
+    assert list(words_at) == [found.location]
+    assert "friction" in words_at[found.location] and "preload of 117.00 ± 0.20 N" in words_at[found.location]
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (186.5, 2, "190"),
+        (0.23, 2, "0.23"),
+        (2410.04, 4, "2.41 k"),
+        (999.9e3, 2, "1 M"),
+        (0.0, 4, "0"),
+        (3e-3, 2, "3 m"),
+    ],
+)
+def test_numbers_of_tables_have_no_exponents(value: float, digits: int, text: str) -> None:
+    assert words.number(value, digits) == text
 
 
 @pytest.mark.parametrize(
