@@ -83,6 +83,9 @@ class WhiteNoiseRules:
     empty_from: float = rule(0.46, "the same, above which a filter leaves nothing; derived", 0.44, 0.48)
     even: float = rule(1.8, "ratio of the powers of even bands; chosen: chance of few blocks", 1.5, 2.5)
     empty: float = rule(0.2, "of them that an empty band has at most; chosen: a filter leaves 0.01", 0.1, 0.3)
+    response: int = rule(6, "samples either way, of a force's response to a motion; chosen: spring to inertia", 3, 10)
+    response_samples: int = rule(20, "of a series for each of them; derived: noise lost is a fortieth", 10, 50)
+    response_seen: float = rule(1e-8, "of the largest, of directions that are fitted; derived: rounding", 1e-10, 1e-6)
 
 
 @dataclass(frozen=True)
@@ -419,6 +422,7 @@ class ComponentRules:
     starts: int = rule(2, "trial shapes from which a law is refined; chosen", 1, 4)
     close: int = rule(6, "laws that are refined in every round; chosen", 4, 10)
     declared: float = rule(0.02, "of the force, up to which a declared noise is believed; chosen", 0.01, 0.05)
+    misdeclared: float = rule(10.0, "times a declared noise, that an instrument has at most; chosen", 5.0, 20.0)
     surface_serves: float = rule(0.9, "of the held-out power that an unnamed force may leave; chosen", 0.8, 0.97)
     named: float = rule(0.8, "of the excess power; chosen: laws that leave more are not the component's", 0.6, 0.9)
     together: float = rule(

@@ -108,6 +108,8 @@ def _doubtful(judged: JudgedComponent, rules: VerdictRules) -> bool:
     carried = bool(steps) and share is not None and share >= _least(steps, judged.final.task.rules)
     if np.any(judged.errors.unexplained(rules) > 0) and not carried:
         return True
+    if steps and (judged.errors.outweigh_findings(rules) or judged.errors.reject(rules)):
+        return True
     return bool(_undetermined(judged)) or smooth_serves(judged.final, len(judged.record.given.pieces))
 
 

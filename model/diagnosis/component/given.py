@@ -32,7 +32,9 @@ def given_model(
         if all(placed.fixed) and isinstance(placed.law, ElementLaw):
             held.append(placed)
             continue
-        if any(placed.fixed):
+        if all(placed.fixed):
+            notes.append(f"{element}: {placed.law.name} is estimated, though fixed: component tests cannot hold it")
+        elif any(placed.fixed):
             notes.append(
                 f"{element}: some values of {placed.law.name} are fixed in the system file, others not: component "
                 "tests hold all values of a law or none; none is held"

@@ -23,11 +23,11 @@ from sprung.model.diagnosis.force.motion import (
 )
 from sprung.model.diagnosis.force.piece import Piece
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
-from sprung.model.diagnosis.record.white_noise import white_noise
+from sprung.model.diagnosis.record.white_noise import white_noise, without_motion
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.laws import Law, SpringDamper
 from sprung.model.laws.following import Covariate
-from sprung.model.schema import GROUND, ElementSensor, SupportInput
+from sprung.model.schema import GROUND, ElementSensor, Sensor, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -162,12 +162,23 @@ def _record(
         nominal=NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping"))),
         rules=rules.component,
         signals=covariates(system, values, sample_rate, element, notes),
-        noise=max(noise_at_rest(measured.force, rests) or 0.0, white_noise(force, rules.white_noise)),
+        noise=_noise(measured, rests, run, system.file.sensors[sensor], rules),
         declared=system.file.sensors[sensor].noise,
         held=held,
         delay_std=min(_delay_std(system, sensor), 1 / sample_rate),
     )
     return ComponentRecord(element, sensor, task, tuple(notes), given, own)
+
+
+def _noise(measured: _Measured, rests: list[slice], run: slice, cell: Sensor, rules: Rules) -> float:
+    """Noise of a load cell that the record shows at standstill or in its fastest changes, N.
+
+    Friction and stops change a force as fast as noise does: where the file declares the noise, it is no larger than
+    declarations are wrong by.
+    """
+    force = without_motion(measured.force[run], measured.displacement[run], rules.white_noise)
+    shown = max(noise_at_rest(measured.force, rests) or 0.0, white_noise(force, rules.white_noise))
+    return min(shown, rules.component.misdeclared * cell.noise) if cell.noise > 0 else shown
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ class ElementMotion:
     rate_noise: float  # m/s
     dense: ElementMotion | None = None  # the same motion with values between the samples
     stride: int = 1  # dense samples per sample
+    acceleration: FloatArray | None = None  # m/s^2, (T,)
 
     @classmethod
     def of(
@@ -42,7 +43,8 @@ class ElementMotion:
     ) -> ElementMotion:
         """A motion with interpolated values, since laws with memory depend on reversals between samples."""
         finer = int(np.clip(_MOST // len(time), 1, _FINER))
-        motion = cls(time, deflection, rate, deflection_noise, rate_noise)
+        acceleration = _differentiated(rate, float(time[1] - time[0]))
+        motion = cls(time, deflection, rate, deflection_noise, rate_noise, acceleration=acceleration)
         if finer == 1:
             return motion
         between = np.linspace(time[0], time[-1], (len(time) - 1) * finer + 1)
@@ -83,13 +85,16 @@ class ElementMotion:
         """The motion delayed by `late`, s, interpolated by cubic splines; constant beyond the ends."""
         if late == 0.0:
             return self
-        earlier = self._between(np.clip(self.time - late, self.time[0], self.time[-1]))
+        at = np.clip(self.time - late, self.time[0], self.time[-1])
         dense = None if self.dense is None else self.dense.delayed(late)
-        return replace(self, deflection=earlier[:, 0], rate=earlier[:, 1], dense=dense)
+        earlier = self._between(at)
+        acceleration = earlier[:, 2] if self.acceleration is not None else None
+        return replace(self, deflection=earlier[:, 0], rate=earlier[:, 1], acceleration=acceleration, dense=dense)
 
     @cached_property
     def _between(self) -> CubicSpline:
-        return CubicSpline(self.time, np.column_stack([self.deflection, self.rate]))
+        further = () if self.acceleration is None else (self.acceleration,)
+        return CubicSpline(self.time, np.column_stack([self.deflection, self.rate, *further]))
 
     def noisier(self, seed: int = 0) -> ElementMotion:
         """The motion with added noise of its own level and band."""
@@ -134,6 +139,7 @@ class ElementMotion:
             rate=self.rate[::stride],
             dense=None,
             stride=1,
+            acceleration=None if self.acceleration is None else self.acceleration[::stride],
         )
 
 
@@ -183,15 +189,18 @@ def still_stretches(series: FloatArray, sample_rate: float, all_rules: Rules = R
 
 
 def noise_at_rest(series: FloatArray, stretches: list[slice]) -> float | None:
-    """Standard deviation of a series (T,) about a line over the stretches of standstill; None without any."""
-    squares, count = 0.0, 0
+    """Standard deviation of a series (T,) about a line in the quietest standstill; None without any.
+
+    What rings down, creeps or trembles after a test is no noise.
+    """
+    levels = []
     for stretch in stretches:
         values = series[stretch]
-        at = np.arange(len(values))
-        rest = values - np.polyval(np.polyfit(at, values, 1), at)
-        squares += float(rest @ rest)
-        count += len(values) - 2
-    return float(np.sqrt(squares / count)) if count > 0 else None
+        if len(values) > 2:
+            at = np.arange(len(values))
+            rest = values - np.polyval(np.polyfit(at, values, 1), at)
+            levels.append(float(np.sqrt(rest @ rest / (len(values) - 2))))
+    return min(levels, default=None)
 
 
 def element_motion(
@@ -224,6 +233,13 @@ def element_motion(
     smooth = np.add(periodic, _line(displacement, sample_rate, count, line), dtype=np.float64)
     left = float(np.sqrt(np.mean(passed**2)) * noise)
     return ElementMotion.of(time, smooth, rate, left, float(np.sqrt(np.mean(rate_power))))
+
+
+def _differentiated(rate: FloatArray, step: float) -> FloatArray:
+    """Rate of change of a rate (T,), at all frequencies of the record alike."""
+    count = len(rate)
+    spectrum, omega, line = _continued(rate, 1 / step)
+    return np.asarray(np.fft.irfft(1j * omega * spectrum, 3 * count - 2)[count - 1 : 2 * count - 1] + line)
 
 
 def _line(series: FloatArray, sample_rate: float, count: int, slope: float) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 from sprung.model.diagnosis.force.motion import ElementMotion
 from sprung.model.diagnosis.kinds import EffectKind, kind_of_law
 from sprung.model.diagnosis.rules import RULES, ComponentRules
-from sprung.model.laws import CLOCK_LEAD, UNIT_ELEMENT, ElementLaw, SpringDamper, reversal_step
+from sprung.model.laws import CLOCK_LEAD, UNIT_ELEMENT, ElementLaw, SpringDamper, StructureLaw, reversal_step
 from sprung.model.laws.along import force_along
 from sprung.model.laws.base import RARE
 from sprung.model.laws.basis import UNKNOWN
@@ -113,7 +113,7 @@ class Piece:
     Functions of it take `a`, the strengths, `s`, the shapes, `e`, the element, and `p`, the law's parameters.
     """
 
-    law: ElementLaw
+    law: ElementLaw | StructureLaw
     _: KW_ONLY
     signs: tuple[int, ...]  # of the strengths: 1, -1, 0 for either
     parameters: Parameters  # of the law, by strengths, shapes and element; linear in the strengths
@@ -163,6 +163,7 @@ class Piece:
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
         """Force per strength along a motion, (T, m); deflections relative to the middle of the travel."""
         law, of = self.acting or self.law, self.acting_parameters or self.parameters
+        assert isinstance(law, ElementLaw)
         follows = self.kind is HYSTERESIS and law.path is not None
         along, stride = (motion.followed, motion.stride) if follows else (motion, 1)
         d = along.deflection - motion.middle
@@ -182,6 +183,15 @@ class Piece:
 
 
 @dataclass(frozen=True)
+class InertiaPiece(Piece):
+    """A mass that moves with the deflection: of a clamp between specimen and load cell, of a rod, of oil in a pipe."""
+
+    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
+        assert motion.acceleration is not None
+        return motion.acceleration[:, None]
+
+
+@dataclass(frozen=True)
 class Following:
     """A law whose strengths depend linearly on a measured signal, about its mean.
 
@@ -196,7 +206,7 @@ class Following:
     lagged: bool = False
 
     @property
-    def law(self) -> ElementLaw:
+    def law(self) -> ElementLaw | StructureLaw:
         return self.piece.law
 
     @property

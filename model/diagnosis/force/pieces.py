@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.force.piece import Piece
+from sprung.model.diagnosis.force.piece import InertiaPiece, Piece
 from sprung.model.diagnosis.force.pieces_damping import DAMPING_PIECES
 from sprung.model.diagnosis.force.pieces_friction import FRICTION_PIECES
 from sprung.model.diagnosis.force.pieces_stiffness import STIFFNESS_PIECES
 from sprung.model.laws import ElementLaw, grid
 from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
+from sprung.model.laws.structure import INERTER
 
 
 def _drift(law: ElementLaw, quantity: str) -> Piece:
@@ -30,10 +31,13 @@ def _drift(law: ElementLaw, quantity: str) -> Piece:
     )
 
 
+_INERTIA = InertiaPiece(INERTER, signs=(1,), parameters=lambda a, s, e: (a[0],))
+
 PIECES: tuple[Piece, ...] = (
     *FRICTION_PIECES,
     *DAMPING_PIECES,
     *STIFFNESS_PIECES,
     _drift(TIME_VARYING_STIFFNESS, "stiffness"),
     _drift(TIME_VARYING_DAMPING, "damping"),
+    _INERTIA,
 )

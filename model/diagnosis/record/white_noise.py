@@ -22,6 +22,24 @@ def white_noise(series: FloatArray, rules: WhiteNoiseRules = RULES.white_noise) 
     return max(float(np.sqrt(np.median([block.mean() for block in blocks]))), _below_the_cutoff(series, rules))
 
 
+def without_motion(series: FloatArray, motion: FloatArray, rules: WhiteNoiseRules = RULES.white_noise) -> FloatArray:
+    """A series (T,) less what is a linear response to a motion (T,) at the highest frequencies.
+
+    What a rig is still driven with there makes forces of inertia and of dampers that are no noise.  A filter of few
+    samples either way is fitted to differences of high order, which motion far below hardly enters.
+    """
+    reach = rules.response
+    if len(series) < rules.response_samples * (2 * reach + 1):
+        return series
+    shifted = np.lib.stride_tricks.sliding_window_view(np.pad(motion, reach, mode="edge"), 2 * reach + 1)
+    fast, target = np.diff(shifted, rules.order, axis=0), np.diff(series, rules.order)
+    size = np.linalg.norm(fast, axis=0)
+    if not np.all(size > 0):
+        return series
+    response = np.linalg.lstsq(fast / size, target, rcond=rules.response_seen)[0] / size
+    return np.asarray(series - shifted @ response)
+
+
 def _below_the_cutoff(series: FloatArray, rules: WhiteNoiseRules) -> float:
     """Standard deviation of white noise that a filter has cut off below half the sample rate, as resampling does.
 

@@ -287,6 +287,8 @@ def test_standstill_is_found_and_its_noise_measured() -> None:
     assert 560 <= stretch.stop <= 620
     force = np.random.default_rng(4).standard_normal(len(series)) * 3.0
     assert noise_at_rest(force, [stretch]) == pytest.approx(3.0, rel=0.1)
+    ringing = force + np.where(np.arange(len(force)) < 2000, 0.0, 40.0 * np.sin(np.arange(len(force))))
+    assert noise_at_rest(ringing, [stretch, slice(2000, 2200)]) == pytest.approx(3.0, rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(3))

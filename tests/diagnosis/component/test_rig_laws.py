@@ -9,6 +9,7 @@ from scipy.signal import butter, chirp, sosfiltfilt
 
 from sprung.benchmarks.real_reference import bouc_wen
 from sprung.model.diagnosis.api import Report, diagnose
+from sprung.model.diagnosis.component.measured import component_records
 from sprung.model.diagnosis.force.fit import ComponentTask
 from sprung.model.diagnosis.force.motion import element_motion
 from sprung.model.diagnosis.force.piece import FittedPiece
@@ -195,3 +196,87 @@ def test_a_friction_that_turns_slowly_is_not_distinguished_from_a_valve(smoothin
     if not told:
         assert friction.family is not None
         assert {"coulomb_friction", "damper_blowoff"} <= set(friction.family.split(" or "))
+
+
+def test_the_inertia_of_a_fixture_is_named_with_its_mass() -> None:
+    """A rubber mount that is swept up to 40 Hz: clamp and rod between it and the load cell weigh 6 kg."""
+    rate, seconds = 400.0, 20.0
+    t = np.arange(int(rate * seconds)) / rate
+    phase = 2 * np.pi * (0.5 * t + (40.0 - 0.5) / (2 * seconds) * t**2)
+    turning = 2 * np.pi * (0.5 + (40.0 - 0.5) / seconds * t)
+    d, v = 1.5e-3 * np.sin(phase), 1.5e-3 * turning * np.cos(phase)
+    a = 1.5e-3 * (-(turning**2) * np.sin(phase) + 2 * np.pi * (40.0 - 0.5) / seconds * np.cos(phase))
+    random = np.random.default_rng(5)
+    force = 8e5 * d + 900.0 * v + 6.0 * a + 500.0 + random.standard_normal(len(t))
+    system = parse_system(f"""
+name: mount on a test bench
+sample_rate: {rate}
+window: 400
+bodies: {{}}
+inputs: {{rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}}}
+elements:
+  mount: {{upper: rod, lower: ground, stiffness: 6e5, damping: 700.0}}
+sensors: {{cell: {{kind: force, element: mount, csv: F, noise: 1.0}}}}
+""")
+    values = np.column_stack([d + 4e-7 * random.standard_normal(len(t)), force])
+    report = diagnose(system, RigRecording(values, rate))
+    assert report.verdict == "missing_physics"
+    assert named(report, "inerter")["inertance"] == pytest.approx(6.0, rel=0.03)
+    assert report.explained is not None and report.explained > 0.98
+
+
+def shaken(seconds: float, rate: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Time, deflection, rate and acceleration of random motion whose acceleration is white up to 0.45 of the rate."""
+    count, random = int(seconds * rate), np.random.default_rng(seed)
+    omega = 2 * np.pi * np.fft.rfftfreq(count, 1 / rate)
+    spectrum = random.standard_normal(len(omega)) + 1j * random.standard_normal(len(omega))
+    spectrum *= (omega > 2 * np.pi) & (omega < 0.9 * np.pi * rate)
+    motion = [np.fft.irfft(spectrum / (1j * np.maximum(omega, 1.0)) ** power, count) for power in (2, 1, 0)]
+    scale = 4e-3 / np.std(motion[0])
+    d, v, a = (scale * series for series in motion)
+    return np.arange(count) / rate, d, v, a
+
+
+def test_a_force_at_the_highest_frequencies_that_follows_the_motion_is_no_noise() -> None:
+    """A linear rig with a clamp of 1 kg: its force of inertia is white, and far above the noise of the cell."""
+    rate, noise = 250.0, 1.0
+    t, d, v, a = shaken(40.0, rate, 20)
+    random = np.random.default_rng(21)
+    force = 5e4 * d + 1200.0 * v + 1.0 * a + noise * random.standard_normal(len(t))
+    system = parse_system(f"""
+name: damper on a test bench
+sample_rate: {rate}
+window: 250
+bodies: {{}}
+inputs: {{rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}}}
+elements:
+  damper: {{upper: rod, lower: ground, stiffness: 3.5e4, damping: 900.0}}
+sensors: {{cell: {{kind: force, element: damper, csv: F, noise: {noise}}}}}
+""")
+    values = np.column_stack([d + 1e-6 * random.standard_normal(len(t)), force])
+    (record,) = component_records(system, values, rate)
+    assert record.task.noise == pytest.approx(noise, rel=0.5)
+    assert diagnose(system, RigRecording(values, rate)).verdict != "consistent"
+
+
+def test_friction_that_turns_as_fast_as_noise_is_no_noise_beyond_what_a_declaration_may_be_wrong_by() -> None:
+    rate = 200.0
+    _, d, v, _ = shaken(30.0, rate, 4)
+    force = 4e4 * d + 600.0 * np.sign(v) + np.random.default_rng(5).standard_normal(len(d))
+
+    def seen(declared: str) -> float:
+        system = parse_system(f"""
+name: damper on a test bench
+sample_rate: {rate}
+window: 64
+bodies: {{}}
+inputs: {{rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}}}
+elements:
+  damper: {{upper: rod, lower: ground, stiffness: 4e4, damping: 1.5e3}}
+sensors: {{cell: {{kind: force, element: damper, csv: F{declared}}}}}
+""")
+        (record,) = component_records(system, np.column_stack([d, force]), rate)
+        return record.task.noise
+
+    assert seen("") > 50.0  # not declared: nothing speaks against it
+    assert seen(", noise: 1.0") <= 10.0

@@ -219,6 +219,7 @@ def _terms(fit: ComponentFit, place: str, along: ForceAlongMotion) -> Iterator[T
         if not isinstance(piece, Piece):
             continue
         law = piece.law
+        assert isinstance(law, ElementLaw)  # of `_pieces`
         values = law.clip([value for value, _ in fit.values(index).values()])
         scales = typical_scales(law, seen)
         yield Term(law, place, tuple(values.tolist()), "" if law.screened else WIDER, scales=scales)
