@@ -53,7 +53,7 @@ def fit(
         scale = np.sqrt(np.diag(information))
         scaled = information / np.outer(scale, scale)
         step = -scipy.linalg.solve(scaled + damping * np.eye(len(scale)), slope / scale, assume_a="pos") / scale
-        step *= min(1.0, STEP_LIMIT / np.abs(step).max())
+        step *= STEP_LIMIT / max(STEP_LIMIT, float(np.abs(step).max()))
         moved = x.copy()
         moved[chosen] += step
         try:
