@@ -47,7 +47,7 @@ class Rate:
 def posterior(free: IntArray) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance of the free values, the others known to be 0."""
     F, std = FACTOR[:, free], PRIOR.std[free]
-    covariance = np.linalg.inv(F.T @ F + np.diag(std**-2))
+    covariance = np.asarray(np.linalg.inv(F.T @ F + np.diag(std**-2)), dtype=np.float64)
     return covariance @ (F.T @ TARGET + PRIOR.mean[free] / std**2), covariance
 
 
