@@ -130,7 +130,8 @@ sensors:
     layout = lay_out(rig)
     assert layout.bottom("rod") == layout.top("rod") > layout.top("ground") == 0.0
     (axes,) = draw_system(rig, {"damper": "dry friction of 90 N; static preload of 117 N"}, {}).axes
-    drawn = np.concatenate([line.get_ydata() for line in axes.lines if len(line.get_ydata()) == 13])  # the spring's
+    heights = [np.asarray(line.get_ydata(), dtype=float) for line in axes.lines]
+    drawn = np.concatenate([line for line in heights if len(line) == 13])  # the spring's
     assert drawn.min() == 0.0 and drawn.max() == layout.bottom("rod")
     assert "dry friction of 90 N" in axes.texts[-1].get_text() and "preload" in axes.texts[-1].get_text()
 
