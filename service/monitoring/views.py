@@ -97,6 +97,11 @@ class VehicleView:
         return tuple(alarm for alarm in self.alarms if alarm.closed is None)
 
     @property
+    def fits(self) -> bool:
+        """Whether the newest window says how well the model fits; that of a standing vehicle is of noise alone."""
+        return self.last is not None and self.last.outcome != UNINFORMATIVE
+
+    @property
     def largest(self) -> ParameterView | None:
         """The parameter with the largest drift from its baseline; None while all are learning."""
         drifted = [p for p in self.parameters if p.drift is not None and p.identifiable]
@@ -105,8 +110,7 @@ class VehicleView:
     def status(self, elements: Sequence[str]) -> Status:
         """The vehicle's line in the list of the fleet; `elements` in the order of the drawing."""
         counts, largest = self.active_by_severity(), self.largest
-        informative = self.last is not None and self.last.outcome != UNINFORMATIVE  # else the fit before it stands
-        solved = self.last.solved if informative and self.last is not None else None
+        solved = self.last.solved if self.fits and self.last is not None else None  # else the fit before it stands
         letters = {name: "." for name in elements}
         for p in self.parameters:
             letters[p.element] = max(letters.get(p.element, "."), _letter(p), key=LETTERS.index)
@@ -135,12 +139,13 @@ class VehicleView:
     def as_dict(self) -> dict[str, Any]:
         """JSON of `GET /vehicles/{id}`."""
         solved = None if self.last is None else self.last.solved
+        told = {"reason": None if self.last is None else self.last.reason}
         return {
             "vehicle": self.vehicle,
             "model": self.model,
             "health": self.health,
             "last_window": optional_iso(self.last_window_ns),
-            "fit": None if solved is None else fit_dict(solved.nrmse, self.per_sensor),
+            "fit": None if solved is None else fit_dict(solved.nrmse, self.per_sensor) | ({} if self.fits else told),
             "parameters": [p.as_dict() for p in self.parameters],
             "alarms": [alarm_dict(alarm) for alarm in self.active],
             **self.measurements(),

@@ -147,7 +147,7 @@ def _parameter_families(entries: list[Entry]) -> Iterator[Metric]:
             if p.drift is not None and p.drift_std is not None:
                 ratio.add_metric([view.vehicle, p.element, p.quantity], 1.0 + p.drift)
                 spread.add_metric([view.vehicle, p.element, p.quantity], p.drift_std)
-        for sensor, nrmse in view.per_sensor.items():
+        for sensor, nrmse in view.per_sensor.items() if view.fits else ():
             fit.add_metric([view.vehicle, sensor], nrmse)
         for fault in view.sensors:
             wrong.add_metric([view.vehicle, fault.channel, fault.kind], 1)

@@ -62,3 +62,16 @@ def test_a_vehicle_that_never_ran_has_no_fit(client: TestClient, core: Core, sys
 
 def test_standing_is_no_circumstance(client: TestClient, stood: str) -> None:
     assert client.get("/vehicles/a/circumstances").json()["series"] == {}
+
+
+def test_programs_learn_that_the_fit_of_a_standing_vehicle_says_nothing(
+    client: TestClient, core: Core, system: System
+) -> None:
+    core.pipeline.process("c", [make_window(system, i, 0.1) for i in range(4)])
+    assert 'sprung_fit_nrmse{sensor="car_1l",vehicle="c"}' in client.get("/metrics").text
+    assert client.get("/vehicles/c").json()["fit"].get("reason") is None
+    core.pipeline.process("c", [make_window(system, i, STANDING) for i in range(4, 8)])
+    assert 'vehicle="c"' not in "".join(
+        line for line in client.get("/metrics").text.splitlines() if line.startswith("sprung_fit_nrmse{")
+    )
+    assert "no excitation" in client.get("/vehicles/c").json()["fit"]["reason"]
