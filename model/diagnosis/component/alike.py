@@ -9,7 +9,7 @@ from sprung.model.diagnosis.force.deviations import moved_in_common
 from sprung.model.diagnosis.force.fit import ComponentFit, refined
 from sprung.model.diagnosis.force.low_valve import low_valve
 from sprung.model.diagnosis.force.piece import Lag, Part, Piece
-from sprung.model.diagnosis.force.search import Step, plausible
+from sprung.model.diagnosis.force.ranking import Step, plausible
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray
 

@@ -12,7 +12,8 @@ from sprung.model.diagnosis.component.alike import EquivalentModel, look_alikes
 from sprung.model.diagnosis.component.measured import ComponentRecord
 from sprung.model.diagnosis.force.deviations import covariance, left_open
 from sprung.model.diagnosis.force.fit import ComponentFit
-from sprung.model.diagnosis.force.search import Search, Step
+from sprung.model.diagnosis.force.ranking import Step
+from sprung.model.diagnosis.force.search import Search
 from sprung.model.diagnosis.investigation.configuration.effects import SIGN_REVERSED
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
 from sprung.model.diagnosis.kinds import EffectKind

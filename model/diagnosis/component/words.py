@@ -10,7 +10,7 @@ import numpy as np
 from sprung.model.diagnosis.component.formula import FormulaPiece
 from sprung.model.diagnosis.force.fit import ComponentFit
 from sprung.model.diagnosis.force.piece import Values
-from sprung.model.diagnosis.force.search import Step
+from sprung.model.diagnosis.force.ranking import Step
 from sprung.model.diagnosis.investigation.configuration.effects import SIGN_REVERSED
 from sprung.model.diagnosis.investigation.verdict import kind_of
 from sprung.model.diagnosis.kinds import EffectKind

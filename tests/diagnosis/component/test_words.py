@@ -15,7 +15,7 @@ from sprung.model.diagnosis.component.words import (
 from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentFit, ComponentTask, fitted
 from sprung.model.diagnosis.force.motion import ElementMotion
 from sprung.model.diagnosis.force.pieces import PIECES
-from sprung.model.diagnosis.force.search import Ranked, Step
+from sprung.model.diagnosis.force.ranking import Ranked, Step
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.laws.basis import UNKNOWN
