@@ -31,12 +31,12 @@ from sprung.service.api import (
     vehicle_model,
 )
 from sprung.service.api.description import PROBLEMS, describe
+from sprung.service.api.duplicate_keys import refuse_duplicate_keys
 from sprung.service.api.guard import Guard
 from sprung.service.api.head import HeadAsGet
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.queries import only_known_parameters
 from sprung.service.api.scopes import FORM, NEEDS
-from sprung.service.api.twice import no_key_twice
 from sprung.service.core import Core
 from sprung.service.pages import routes as fleet_page
 from sprung.service.pages import vehicle as vehicle_page
@@ -109,7 +109,7 @@ def create_app(
 
 def _route(app: FastAPI) -> None:
     """Give the application its API, pages and static files."""
-    checks = [Depends(only_known_parameters), Depends(no_key_twice)]
+    checks = [Depends(only_known_parameters), Depends(refuse_duplicate_keys)]
     for router in (
         *(part.router for part in (*_PARTS, fleet_page, vehicle_page, work_pages)),
         admin.pages,

@@ -26,13 +26,13 @@ from sprung.service.api.server import make_server
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.errors import UserError
-from sprung.service.insisting import insist
 from sprung.service.jobs.recordings import add_row, file_row, finish_row, reading_limits
 from sprung.service.lock import held
 from sprung.service.monitoring.engine import load_engine
 from sprung.service.monitoring.numerics import numerics
 from sprung.service.observability.connections import ConnectionCollector
 from sprung.service.processes.worker import ProcessLimits
+from sprung.service.retrying import retry
 from sprung.service.settings import Settings
 from sprung.service.sources.feed import FeedResult, OnBatch, feed_file, vehicle_of
 from sprung.service.sources.live import LiveFeed
@@ -158,7 +158,7 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
         on_batch, on_end = watch(path, core)
         try:
             row = file_row(path)
-            insist(partial(add_row, core.store, row), path.name, check)
+            retry(partial(add_row, core.store, row), path.name, check)
             fed = feed_file(
                 core.pipeline,
                 path,
@@ -170,9 +170,9 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
                 on_batch=on_batch,
                 on_tally=core.tally_counter("file"),
                 check=check,
-                insistent=True,
+                retrying=True,
             )
-            insist(partial(finish_row, core.store, row, fed), path.name, check)
+            retry(partial(finish_row, core.store, row, fed), path.name, check)
             on_end(fed)
         except Interrupted:
             return

@@ -55,7 +55,7 @@ BESIDE = {"diagnosis": _BELOW, "exchange": _BELOW, "alps": ORDER}
 # Inside `service` every name imports only names to its left
 SERVICE_ORDER = (
     "errors",
-    "insisting",
+    "retrying",
     "times",
     "settings",
     "durable",

@@ -13,8 +13,8 @@ from pydantic_core import PydanticCustomError, from_json
 
 from sprung.model.signals import FloatArray
 from sprung.model.text import CONTROL, IN_VEHICLE_IDS, UNSEEN
+from sprung.service.api.duplicate_keys import duplicate_keys
 from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
-from sprung.service.api.twice import keys_twice
 from sprung.service.fleet.message import SentWindows
 from sprung.service.monitoring.form import WindowForm
 from sprung.service.times import FIRST_TIME, NANOSECONDS, from_iso, to_iso
@@ -148,7 +148,7 @@ def _object(content: bytes) -> dict[str, object]:
     if not isinstance(raw, dict):
         raise ApiProblem(422, "body: should be an object", [_wrong("body", "should be an object")])
     # the parser keeps the last of two keys; each string has two quotation marks, and what was kept accounts for all
-    if (b"\\" in content or content.count(b'"') != 2 * _strings(raw)) and (names := keys_twice(content)):
+    if (b"\\" in content or content.count(b'"') != 2 * _strings(raw)) and (names := duplicate_keys(content)):
         raise _refused([_wrong(name[:160], "is there twice") for name in names])
     return raw
 

@@ -146,7 +146,7 @@ class DiagnosisJobs:
                 if vehicle is not None and row.source == "excerpt":
                     fleet.attach_report(connection, vehicle, served.model_id, report_id)
 
-        progress.insist(keep)  # rather than search once more
+        progress.retry(keep)  # rather than search once more
         return {"report": report_id, "verdict": found.verdict}
 
     def _diagnose(

@@ -16,7 +16,7 @@ from typing import Literal, Protocol
 from sprung.service.errors import UserError
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.message import Message, read_messages
-from sprung.service.insisting import passes
+from sprung.service.retrying import is_transient
 
 log = logging.getLogger("sprung.broker")
 TOGETHER = 64  # messages of one transaction
@@ -121,7 +121,7 @@ async def _store(messages: Sequence[Message], ingest: Ingest) -> list[Verdict]:
         log.error("a message is left out: %s", error)
         return ["refused"]
     except Exception as error:
-        if passes(error):
+        if is_transient(error):
             log.warning("the store does not take anything (%s); the messages come again", type(error).__name__)
             await asyncio.sleep(AGAIN_SECONDS)
             return ["again"] * len(messages)

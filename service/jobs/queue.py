@@ -20,8 +20,8 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import Busy, NotFound, UserError
-from sprung.service.insisting import insist, message_of
 from sprung.service.observability.queues import WaitMetrics
+from sprung.service.retrying import message_of, retry
 from sprung.service.store import Store, audit, work
 from sprung.service.times import NANOSECONDS, now_ns
 
@@ -75,7 +75,7 @@ class Progress:
             self._shown, self._noted = self._reached, now
             self._note(self._shown)
 
-    def insist(self, work: Callable[[], T]) -> T:
+    def retry(self, work: Callable[[], T]) -> T:
         """What `work` returns, tried again while the store or the machine refuses it and the job has time."""
 
         def noted() -> T:
@@ -87,7 +87,7 @@ class Progress:
             self._trouble = ""
             return found
 
-        return insist(noted, "a job", self.check)
+        return retry(noted, "a job", self.check)
 
     def step(self, share: float) -> None:
         """`share` of the work is done, 0..1; it is noted now or, when the last note is young, by a later check."""
@@ -272,7 +272,7 @@ class Jobs:
             if kind is None:
                 raise UserError(f"jobs of kind {job.kind!r} are not known to this version")
             run = kind.run
-            result = progress.insist(lambda: run(job, progress))
+            result = progress.retry(lambda: run(job, progress))
             return {"state": "done", "progress": 1.0, "result": result, "attempts": job.attempts}
         except ServiceStopped:
             return {"state": "queued", "attempts": job.attempts}  # an end in good order is no attempt

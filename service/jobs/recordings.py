@@ -49,11 +49,11 @@ class RecordingJobs:
                 on_tally=self._counter(),
                 check=progress.check,
                 start=row.began_ns,
-                insistent=True,
+                retrying=True,
             )
         except (UnreadableRecording, UserError) as error:
             raise UserError(str(error).replace(str(path), row.name)) from error
-        progress.insist(lambda: finish_row(self._pipeline.store, row, fed))
+        progress.retry(lambda: finish_row(self._pipeline.store, row, fed))
         return {"recording": row.id} | fed.summary()
 
 

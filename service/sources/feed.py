@@ -16,12 +16,12 @@ from sprung.model.signals import Tally, Window
 from sprung.model.text import IN_VEHICLE_IDS
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.errors import UserError
-from sprung.service.insisting import Insist, insist
 from sprung.service.monitoring import rides
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import Batch, IdentifiedBatch
 from sprung.service.processes.worker import ProcessLimits
+from sprung.service.retrying import Retry, retry
 from sprung.service.sources.reading import Ending, Reading, ReadRequest, ReadWindows, prefetched, reading_of
 from sprung.service.store import work
 from sprung.service.times import AHEAD, now_ns, to_iso
@@ -105,7 +105,7 @@ def feed_file(
     on_tally: OnTally = lambda tally: None,
     check: Callable[[], None] = lambda: None,
     start: int | None = None,
-    insistent: bool = False,
+    retrying: bool = False,
 ) -> FeedResult:
     """Read a recording to its end, through the pipeline.
 
@@ -113,7 +113,7 @@ def feed_file(
     speed: times real time; 0: as fast as possible.  limits: read in a process of its own, within these.
     start: ns since 1970, when the recording began if its times count from 0; else the file's own time is taken.
     check: called while waiting; this stops with whatever it or `on_batch` raises, batches before are stored.
-    insistent: a store that refuses a batch is asked again until it takes it, or `check` raises.
+    retrying: a store that refuses a batch is asked again until it takes it, or `check` raises.
     Raises UnreadableRecording, or UserError where the limits are exceeded.
     """
     request = ReadRequest(
@@ -130,7 +130,7 @@ def feed_file(
         file_name=file_name or path.name,
         recording_id=recording_id,
         priority=Priority.LIVE if speed else Priority.BATCH,
-        take=partial(insist, what=file_name or path.name, check=check) if insistent else _at_once,
+        take=partial(retry, what=file_name or path.name, check=check) if retrying else _at_once,
     )
     found = prefetched(feed.identified(reading, check), 1, check)
     try:
@@ -160,7 +160,7 @@ class _FileFeed:
     file_name: str
     recording_id: str | None
     priority: Priority
-    take: Insist[Any]  # does what needs the store, again and again if the feed is insistent
+    take: Retry[Any]  # does what needs the store, again and again if the feed is retrying
 
     def vehicle_of(self, recorded: str | None) -> str:
         """The vehicle's name; recorded: as the recording has it."""

@@ -19,9 +19,9 @@ from typing import Protocol
 from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.model.text import first_line
 from sprung.replay.auxiliary import AuxiliaryMeans
-from sprung.service.insisting import FIRST_RETRY, LAST_RETRY, passes
 from sprung.service.monitoring.compute import Priority
 from sprung.service.monitoring.engine import Engine
+from sprung.service.retrying import FIRST_RETRY, LAST_RETRY, is_transient
 from sprung.service.sources.feed import OnTally
 from sprung.service.sources.reading import windower_of
 
@@ -236,7 +236,7 @@ class LiveFeed:
                 self._refused, self._failed_in_a_row = "", 0
                 return
             except Exception as error:
-                if not passes(error):
+                if not is_transient(error):
                     self._leave_out(windows, error)
                     return
                 if not self._refused:

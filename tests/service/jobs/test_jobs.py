@@ -164,7 +164,7 @@ def test_a_store_that_refuses_the_end_of_a_job_is_asked_again(store: Store, monk
 def test_a_job_that_the_machine_refuses_for_a_while_is_done(
     store: Store, monkeypatch: pytest.MonkeyPatch, trouble: Exception
 ) -> None:
-    monkeypatch.setattr("sprung.service.insisting.FIRST_RETRY", 0.01)
+    monkeypatch.setattr("sprung.service.retrying.FIRST_RETRY", 0.01)
     troubles = [trouble] * 3
 
     def refused(_job: JobRow, _progress: Progress) -> dict[str, Any]:

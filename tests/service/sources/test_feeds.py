@@ -134,7 +134,7 @@ def test_the_same_upload_twice_stores_nothing_twice(client: TestClient, recordin
 def test_a_store_that_refuses_for_a_while_costs_no_recording(
     client: TestClient, core: Core, recording: Path, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    monkeypatch.setattr("sprung.service.insisting.FIRST_RETRY", 0.01)
+    monkeypatch.setattr("sprung.service.retrying.FIRST_RETRY", 0.01)
     refusals = {"keep": 3, "identify": 2, "state": 1}
 
     def refusing(name: str) -> Any:

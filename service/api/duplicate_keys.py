@@ -14,7 +14,7 @@ LOOKED_AT_BY_ROUTE = ("/identify",)  # which is asked a thousand times as often 
 AT_ONCE = 20_000  # bytes; longer bodies are looked at in a thread
 
 
-def keys_twice(content: bytes) -> list[str]:
+def duplicate_keys(content: bytes) -> list[str]:
     """Names that an object of the document has more than once, in the order in which their objects end.
 
     Empty for invalid JSON, which its reader reports.
@@ -33,13 +33,13 @@ def keys_twice(content: bytes) -> list[str]:
     return list(found)
 
 
-async def no_key_twice(request: Request) -> None:
+async def refuse_duplicate_keys(request: Request) -> None:
     """422 for a JSON body with an object that names a key twice."""
     kind = request.headers.get("content-type", "application/json").split(";")[0].strip().lower()
     if request.method in ("GET", "HEAD") or kind != "application/json" or request.url.path in LOOKED_AT_BY_ROUTE:
         return
     content = await request.body()
-    names = keys_twice(content) if len(content) < AT_ONCE else await run_in_threadpool(keys_twice, content)
+    names = duplicate_keys(content) if len(content) < AT_ONCE else await run_in_threadpool(duplicate_keys, content)
     if names:
         errors = [{"field": name[:160], "detail": "is there twice"} for name in names[:SHOWN_ERRORS]]
         raise ApiProblem(422, f"{errors[0]['field']} is there twice", errors)
