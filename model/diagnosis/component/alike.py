@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 from sprung.model.diagnosis.force.deviations import moved_in_common
 from sprung.model.diagnosis.force.fit import ComponentFit, refined
+from sprung.model.diagnosis.force.lag import Lag
 from sprung.model.diagnosis.force.low_valve import low_valve
-from sprung.model.diagnosis.force.piece import Lag, Part, Piece
+from sprung.model.diagnosis.force.parts import Part
+from sprung.model.diagnosis.force.piece import Piece
 from sprung.model.diagnosis.force.ranking import Step, plausible
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray

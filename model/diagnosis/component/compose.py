@@ -19,7 +19,7 @@ from sprung.model.diagnosis.component.words import (
 )
 from sprung.model.diagnosis.force.deviations import covariance, spread
 from sprung.model.diagnosis.force.fit import ComponentFit
-from sprung.model.diagnosis.force.piece import Lag
+from sprung.model.diagnosis.force.lag import Lag
 from sprung.model.diagnosis.investigation.state import Options, Recorded
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import (

@@ -13,11 +13,14 @@ from sprung.model.diagnosis.component.judgement import JudgedComponent, conclude
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
 from sprung.model.diagnosis.component.smooth import smooth_serves
 from sprung.model.diagnosis.force.fit import ComponentModel, fitted, refined
-from sprung.model.diagnosis.force.piece import HYSTERESIS, SURFACE, Lag, Part, Piece
+from sprung.model.diagnosis.force.lag import Lag
+from sprung.model.diagnosis.force.parts import Part
+from sprung.model.diagnosis.force.piece import HYSTERESIS, Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.ranking import Ranked, Step, determined
 from sprung.model.diagnosis.force.search import Progress as PieceProgress
 from sprung.model.diagnosis.force.search import search
+from sprung.model.diagnosis.force.slider_surface import SURFACE
 from sprung.model.diagnosis.investigation.state import Options, Progress, Recorded
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.diagnosis.rules import ComponentRules, VerdictRules

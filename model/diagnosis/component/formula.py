@@ -13,9 +13,10 @@ import numpy as np
 
 from sprung.model.diagnosis.force.deviations import covariance, spread
 from sprung.model.diagnosis.force.fit import ComponentModel, ComponentTask, refined
-from sprung.model.diagnosis.force.piece import HYSTERESIS, STATIC, MotionSizes, Piece, Shape
+from sprung.model.diagnosis.force.piece import HYSTERESIS, STATIC, Piece, Shape
 from sprung.model.diagnosis.force.ranking import Ranked, Step, next_laws
 from sprung.model.diagnosis.force.search import Search
+from sprung.model.diagnosis.force.sizes import MotionSizes
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance
 from sprung.model.laws import UNIT_ELEMENT, ElementLaw, Motion, Observed, SpringDamper

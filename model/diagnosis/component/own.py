@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sprung.model.diagnosis.force.motion import ElementMotion
-from sprung.model.diagnosis.force.piece import HYSTERESIS, STATIC, FittedPiece, MotionSizes, Piece, Shape
+from sprung.model.diagnosis.force.piece import HYSTERESIS, STATIC, FittedPiece, Piece, Shape
+from sprung.model.diagnosis.force.sizes import MotionSizes
 from sprung.model.laws import UNIT_ELEMENT, ElementLaw, Law, Observed, SpringDamper, observe
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray

@@ -13,7 +13,9 @@ import numpy as np
 
 from sprung.model.diagnosis.force.fit import ComponentFit, fitted, refined
 from sprung.model.diagnosis.force.motion import ElementMotion
-from sprung.model.diagnosis.force.piece import ELASTIC, MotionSizes, Piece, Shape, SliderSurface
+from sprung.model.diagnosis.force.piece import ELASTIC, Piece, Shape
+from sprung.model.diagnosis.force.sizes import MotionSizes
+from sprung.model.diagnosis.force.slider_surface import SliderSurface
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray
 

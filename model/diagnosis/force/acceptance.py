@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import islice
 
 from sprung.model.diagnosis.force.fit import ComponentFit
-from sprung.model.diagnosis.force.piece import Lag
+from sprung.model.diagnosis.force.lag import Lag
 from sprung.model.diagnosis.force.ranking import Ranked, Step, is_last_determined
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance

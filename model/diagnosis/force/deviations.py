@@ -21,7 +21,8 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.force.fit import ComponentFit, ComponentModel, refined
-from sprung.model.diagnosis.force.piece import LAGS, SURFACE, Lag
+from sprung.model.diagnosis.force.lag import LAGS, Lag
+from sprung.model.diagnosis.force.slider_surface import SURFACE
 from sprung.model.laws import SpringDamper
 from sprung.model.signals import FloatArray
 

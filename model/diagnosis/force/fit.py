@@ -8,8 +8,11 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
+from sprung.model.diagnosis.force.lag import Lag
 from sprung.model.diagnosis.force.motion import ElementMotion
-from sprung.model.diagnosis.force.piece import Lag, MotionSizes, Part, Values
+from sprung.model.diagnosis.force.parts import Part
+from sprung.model.diagnosis.force.piece import Values
+from sprung.model.diagnosis.force.sizes import MotionSizes
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.along import force_along

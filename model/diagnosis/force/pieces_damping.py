@@ -6,14 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.force.piece import (
-    FittedPiece,
-    MotionSizes,
-    Piece,
-    admissible,
-    rates_at,
-    wider_form,
-)
+from sprung.model.diagnosis.force.piece import FittedPiece, Piece, admissible, wider_form
+from sprung.model.diagnosis.force.sizes import MotionSizes, rates_at
 from sprung.model.laws import SpringDamper, grid
 from sprung.model.laws.damping import DAMPER_ASYMMETRY, DAMPER_BLOWOFF, POWER_LAW_DAMPING, QUADRATIC_DAMPING
 from sprung.model.laws.hysteresis import AIR_SPRING, SERIES_STIFFNESS

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from sprung.model.diagnosis.force.piece import Following, LawPiece, Piece
+from sprung.model.diagnosis.force.following import Following
+from sprung.model.diagnosis.force.parts import LawPiece
+from sprung.model.diagnosis.force.piece import Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.laws.following import Covariate, following_law
 

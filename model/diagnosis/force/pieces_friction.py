@@ -10,7 +10,6 @@ from sprung.model.diagnosis.force.piece import (
     FRICTION,
     HYSTERESIS,
     FittedPiece,
-    MotionSizes,
     Piece,
     Shape,
     Values,
@@ -18,6 +17,7 @@ from sprung.model.diagnosis.force.piece import (
     wider_form,
 )
 from sprung.model.diagnosis.force.pieces_damping import LOW_VALVE
+from sprung.model.diagnosis.force.sizes import MotionSizes
 from sprung.model.laws import SpringDamper, grid
 from sprung.model.laws.damping import COULOMB_FRICTION
 from sprung.model.laws.friction import DAHL, LUGRE, STRIBECK

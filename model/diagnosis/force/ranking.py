@@ -13,7 +13,9 @@ import numpy as np
 
 from sprung.model.diagnosis.force.deviations import covariance, left_open, spread
 from sprung.model.diagnosis.force.fit import ComponentFit, ComponentModel, bounded_solution, fitted, refined
-from sprung.model.diagnosis.force.piece import FittedPiece, Lag, LawPiece, Part
+from sprung.model.diagnosis.force.lag import Lag
+from sprung.model.diagnosis.force.parts import LawPiece, Part
+from sprung.model.diagnosis.force.piece import FittedPiece
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import bic, effective_count, level_gain
 from sprung.model.signals import FloatArray

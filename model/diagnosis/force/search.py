@@ -14,7 +14,9 @@ from sprung.model.diagnosis.force.fit import (
     fitted,
     refined,
 )
-from sprung.model.diagnosis.force.piece import LAGS, Following, Lag, LawPiece
+from sprung.model.diagnosis.force.following import Following
+from sprung.model.diagnosis.force.lag import LAGS, Lag
+from sprung.model.diagnosis.force.parts import LawPiece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.pieces_following import pieces_following
 from sprung.model.diagnosis.force.ranking import Ranked, Step, next_laws, plausible, rank

@@ -7,8 +7,9 @@ import pytest
 
 from sprung.model.diagnosis.component.alike import gives_way
 from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentTask, fitted
+from sprung.model.diagnosis.force.lag import LAGS
 from sprung.model.diagnosis.force.motion import element_motion
-from sprung.model.diagnosis.force.piece import LAGS, Piece
+from sprung.model.diagnosis.force.piece import Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.pieces_damping import LOW_VALVE
 

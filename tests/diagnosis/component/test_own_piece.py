@@ -9,7 +9,7 @@ import pytest
 
 from sprung.model.diagnosis.component.own import observed, own_piece, own_pieces
 from sprung.model.diagnosis.force.motion import ElementMotion
-from sprung.model.diagnosis.force.piece import MotionSizes
+from sprung.model.diagnosis.force.sizes import MotionSizes
 from sprung.model.laws import ElementLaw, Motion, SpringDamper, find_law
 
 TIME = np.arange(400) / 100.0

@@ -11,7 +11,8 @@ import pytest
 from sprung.model.diagnosis.force import acceptance
 from sprung.model.diagnosis.force.acceptance import accepted
 from sprung.model.diagnosis.force.fit import ComponentModel
-from sprung.model.diagnosis.force.piece import LAGS, Lag, Part
+from sprung.model.diagnosis.force.lag import LAGS, Lag
+from sprung.model.diagnosis.force.parts import Part
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.ranking import Ranked, Step
 from sprung.model.diagnosis.rules import RULES

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.force.motion import ElementMotion, element_motion
-from sprung.model.diagnosis.force.piece import HYSTERESIS, MotionSizes, Piece
+from sprung.model.diagnosis.force.piece import HYSTERESIS, Piece
 from sprung.model.diagnosis.force.pieces import PIECES
+from sprung.model.diagnosis.force.sizes import MotionSizes
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.along import force_along
 from sprung.model.laws.base import RARE
