@@ -6,7 +6,8 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.fit import optimise as module
+from sprung.model.diagnosis.fit import optimise as optimiser
+from sprung.model.diagnosis.fit import steps
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.fit.optimise import Fit, optimise, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
@@ -27,21 +28,22 @@ def clean() -> tuple[Problem, Fit]:
 
 
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[module._State]:
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[steps.SearchState]:
     """All points that fits evaluate."""
-    states, whole = [], module._state
+    states, whole = [], steps.state_at
 
-    def recorded(*args: Any, **kwargs: Any) -> module._State:
+    def recorded(*args: Any, **kwargs: Any) -> steps.SearchState:
         states.append(whole(*args, **kwargs))
         return states[-1]
 
-    monkeypatch.setattr(module, "_state", recorded)
+    for module in (steps, optimiser):
+        monkeypatch.setattr(module, "state_at", recorded)
     return states
 
 
 @pytest.mark.parametrize("factor", [1.05, 1.5, 4.0])
 def test_a_fit_is_never_worse_than_any_point_that_it_saw(
-    clean: tuple[Problem, Fit], factor: float, seen: list[module._State]
+    clean: tuple[Problem, Fit], factor: float, seen: list[steps.SearchState]
 ) -> None:
     problem, fit = clean
     again = optimise(problem, replace(fit.point, theta=fit.point.theta + np.log(factor)), whitener=fit.whitener)
@@ -64,7 +66,7 @@ def friction(d: float, v: float) -> float:
     ("force", "law", "start"), [(bump_stop, "bump_stop", (5e-3, 3e5)), (friction, "coulomb_friction", (250.0, 8e-3))]
 )
 def test_a_fit_of_a_law_converges_and_is_no_worse_than_any_point_that_it_saw_under_its_inputs(
-    force: Force, law: str, start: tuple[float, float], seen: list[module._State]
+    force: Force, law: str, start: tuple[float, float], seen: list[steps.SearchState]
 ) -> None:
     system = quarter_car()
     signals = prepare(system, simulate(force, seconds=12, seed=3).values, 100.0).signals
@@ -73,15 +75,15 @@ def test_a_fit_of_a_law_converges_and_is_no_worse_than_any_point_that_it_saw_und
     fit = optimise(problem, Point(base.point.theta, (term,), base.point.state))
     assert fit.converged and fit.iterations <= 10
     _, working = smoothed(problem, fit.point, Working(fit.whitener), fit.whitener.whitened(fit.spectrum, problem.part))
-    last = module._state(problem, fit.point, working).value
+    last = steps.state_at(problem, fit.point, working).value
     points = [one.point for one in seen if len(one.point.terms) == 1]
     assert len(points) > fit.iterations
-    assert last <= min(module._state(problem, point, working).value for point in points) + 0.5
+    assert last <= min(steps.state_at(problem, point, working).value for point in points) + 0.5
 
 
 @pytest.mark.parametrize("overshoot", [1.8, 0.6])
 def test_steps_that_miss_by_a_constant_ratio_are_relaxed_to_the_root(overshoot: float) -> None:
-    error, relaxation = np.array([1.0, -2.0, 0.5]), module._Relaxation()
+    error, relaxation = np.array([1.0, -2.0, 0.5]), steps.StepRelaxation()
     for _ in range(3):
         step = -overshoot * error
         relaxation = relaxation.after(step)
@@ -91,7 +93,7 @@ def test_steps_that_miss_by_a_constant_ratio_are_relaxed_to_the_root(overshoot: 
 
 
 def test_steps_in_other_directions_are_taken_whole() -> None:
-    relaxation = module._Relaxation().after(np.array([1.0, 0.0])).after(np.array([0.5, 0.6]))
+    relaxation = steps.StepRelaxation().after(np.array([1.0, 0.0])).after(np.array([0.5, 0.6]))
     assert relaxation.factor == 1.0
 
 
