@@ -26,8 +26,9 @@ from sprung.model.system import System, load_system
 from sprung.replay.writing import write_recording
 from sprung.service.errors import UserError
 from sprung.service.fleet import local_postgres as postgres
-from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, engine_of, list_recordings, opened_store
+from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, engine_of, opened_store
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
+from sprung.service.fleet.recordings import list_recordings
 from sprung.service.fleet.spool import Spool
 from sprung.service.fleet.tasks import HereTasks, RayTasks, Tasks
 from sprung.service.monitoring.compute import Compute

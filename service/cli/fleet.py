@@ -18,12 +18,13 @@ from sprung.model.text import counted
 from sprung.service.cli.options import time_of
 from sprung.service.cli.targets import check_folder
 from sprung.service.errors import UserError
-from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, list_recordings
+from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
 from sprung.service.fleet.broker import Broker, ConsumerCounts, consume
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.kafka_broker import open_kafka
 from sprung.service.fleet.many import diagnose_many
 from sprung.service.fleet.nats_broker import NatsBroker, ack_seconds, without_password
+from sprung.service.fleet.recordings import list_recordings
 from sprung.service.fleet.tasks import tasks_for
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import load_engine

@@ -16,7 +16,8 @@ from sprung.service.diagnosis.task import DiagnosisRequest
 from sprung.service.diagnosis.worker import run
 from sprung.service.durable import sync_file
 from sprung.service.errors import UserError
-from sprung.service.fleet.backfill import FoundFile, list_recordings, local_copy, message_of
+from sprung.service.fleet.backfill import message_of
+from sprung.service.fleet.recordings import FoundFile, list_recordings, local_copy
 from sprung.service.fleet.tasks import Tasks, WorkLost
 from sprung.service.settings import Settings
 

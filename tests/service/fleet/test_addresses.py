@@ -13,7 +13,8 @@ from sprung.model.system import System
 from sprung.replay.writing import write_recording
 from sprung.service.errors import UserError
 from sprung.service.fleet import backfill as module
-from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, list_recordings, local_copy
+from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
+from sprung.service.fleet.recordings import list_recordings, local_copy
 from sprung.service.fleet.tasks import HereTasks
 from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings

@@ -15,6 +15,7 @@ from sprung.replay.writing import write_recording
 from sprung.service.errors import UserError
 from sprung.service.fleet import backfill as module
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
+from sprung.service.fleet.recordings import FoundFile
 from sprung.service.fleet.tasks import HereTasks, WorkLost
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine
@@ -150,7 +151,7 @@ def test_a_backfill_equals_replaying_where_a_sensor_is_faulty(
 def test_a_recording_that_goes_away_before_it_is_read_again_is_reported_of(
     plan: BackfillPlan, place: Path, examiner: BelievingExaminer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def identified(asked: BackfillPlan, file: module.FoundFile) -> module.IdentifiedFile:
+    def identified(asked: BackfillPlan, file: FoundFile) -> module.IdentifiedFile:
         found = identify(asked, file)
         if file.path.endswith("b-north-1.mcap"):  # the last one
             Path(file.path).unlink()
