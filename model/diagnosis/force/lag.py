@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.force.motion import ElementMotion
-from sprung.model.diagnosis.force.piece import STATIC, PieceKind, Plausible, Shape, Values
+from sprung.model.diagnosis.force.piece import STATIC, PieceKind, PlausibilityTest, Shape, Values
 from sprung.model.diagnosis.force.sizes import MotionSizes
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.laws import SpringDamper
@@ -29,7 +29,7 @@ class Lag:
     title: str = SENSOR_LAG.title
     kind: PieceKind = STATIC
     dissipates: bool = False
-    plausible: Plausible = lambda fitted: (
+    plausible: PlausibilityTest = lambda fitted: (
         fitted.rules.late * fitted.step < abs(fitted.shape[0]) < fitted.rules.refined_latest * fitted.rules.latest
     )
     commoner: int = 0

@@ -55,9 +55,9 @@ ELASTIC = PieceKind("elastic", dissipates=False)  # a curve over the deflection 
 FRICTION = PieceKind("friction", dissipates=True)
 HYSTERESIS = PieceKind("hysteresis", dissipates=True)
 
-Parameters = Callable[[FloatArray, Shape, SpringDamper], tuple[float, ...]]
-Plausible = Callable[[FittedPiece], bool]
-Named = Callable[[FloatArray, Shape, SpringDamper], Values]
+LawParameters = Callable[[FloatArray, Shape, SpringDamper], tuple[float, ...]]
+PlausibilityTest = Callable[[FittedPiece], bool]
+QuotedValues = Callable[[FloatArray, Shape, SpringDamper], Values]
 
 
 def no_shapes(seen: MotionSizes) -> FloatArray:
@@ -80,17 +80,17 @@ class Piece:
     law: ElementLaw | StructureLaw
     _: KW_ONLY
     signs: tuple[int, ...]  # of the strengths: 1, -1, 0 for either
-    parameters: Parameters  # of the law, by strengths, shapes and element; linear in the strengths
+    parameters: LawParameters  # of the law, by strengths, shapes and element; linear in the strengths
     shapes: tuple[str, ...] = ()  # names of the nonlinear values
     grid: Callable[[MotionSizes], FloatArray] = no_shapes  # trial shapes, (trials, shapes)
     limits: Callable[[MotionSizes], list[tuple[float, float]]] = no_limits  # of every shape
     shape_of: Callable[[Sequence[float]], tuple[float, ...]] = lambda p: ()  # by the law's parameters
-    quoted: Named = lambda a, s, e: {}
+    quoted: QuotedValues = lambda a, s, e: {}
     kind: PieceKind = STATIC  # look-alikes are mostly of one kind
     rarer: int = 0  # than its law states, along a single motion: as `commoner`
     acting: ElementLaw | None = None  # law of the columns, if not the named one
-    acting_parameters: Parameters | None = None
-    plausible: Plausible = lambda fitted: True  # whether values are plausible for the record
+    acting_parameters: LawParameters | None = None
+    plausible: PlausibilityTest = lambda fitted: True  # whether values are plausible for the record
     imitates: bool = False  # so flexible that it must leave as little as several laws
     at_low_rates: Piece | None = None  # what acts like it where it changes at low rates (`low_valve`)
     yields_with_rate: bool = False  # a yield force above a rate, with a steep slope below it

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.force.motion import ElementMotion
-from sprung.model.diagnosis.force.piece import STATIC, PieceKind, Plausible, Shape, Values
+from sprung.model.diagnosis.force.piece import STATIC, PieceKind, PlausibilityTest, Shape, Values
 from sprung.model.diagnosis.force.sizes import MotionSizes, rates_at
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.laws import SpringDamper
@@ -29,7 +29,7 @@ class SliderSurface:
     key: str = UNKNOWN
     kind: PieceKind = STATIC
     dissipates: bool = False
-    plausible: Plausible = lambda fitted: True
+    plausible: PlausibilityTest = lambda fitted: True
     commoner: int = 0
     shapes: tuple[str, ...] = ()
 
