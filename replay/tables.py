@@ -121,7 +121,8 @@ def find_columns(
     unused = [name for i, name in enumerate(names) if i not in used]
     similar = {name: difflib.get_close_matches(name, unused, n=3, cutoff=0.6) for _, name in lacking}
     if not found or any(similar.values()):
-        hints = "; ".join(_hint(name, close) for name, close in similar.items())
+        order = sorted(similar.items(), key=lambda item: not item[1])  # those with a suggestion first
+        hints = some([_hint(name, close) for name, close in order], NAMES, "; ")
         raise UnreadableRecording(f"{path}: columns not found: {hints}; its columns: {some(names, NAMES)}")
     for place, name in lacking:
         account.note(f"no column {name!r} for {channels[place].name}")

@@ -50,6 +50,7 @@ class RecordRules:
     stuck: float = rule(0.02, "of the recording; chosen: quantised sensors at rest repeat for less", 0.01, 0.05)
     stuck_samples: int = rule(20, "at least, the same; derived: coarse steps of slow channels repeat for less", 10, 40)
     resting: float = rule(0.5, "of the channels that repeat a value together: standstill; chosen", 0.3, 0.7)
+    rest: float = rule(5.0, "s at the noise of all channels: a vehicle that stands; chosen: a platform", 3.0, 10.0)
     held: float = rule(0.05, "Hz; derived: a slower mode is one that no stiffness holds", 0.02, 0.1)
     compared: float = rule(
         0.3, "of the sample rate, up to which spectra are compared; derived: anti-alias filters", 0.25, 0.35

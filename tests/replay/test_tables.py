@@ -301,3 +301,12 @@ def test_a_table_without_rows_says_why(tmp_path: Path, text: str, told: str) -> 
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(UnreadableRecording, match=told):
         read(tmp_path / "a.csv")
+
+
+def test_columns_that_are_not_there_do_not_crowd_out_those_that_are(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(table())
+    channels = [Channel(f"c{i}", "m", 1e-6, column=f"sensor_on_the_left_{i}") for i in range(60)]
+    with pytest.raises(UnreadableRecording) as error:
+        check(tmp_path / "a.csv", [*channels, Channel("x", "m", 1e-6, column="x_"), F])
+    assert "'x_' (did you mean 'x'?)" in str(error.value) and "and 49 more" in str(error.value)
+    assert str(error.value).endswith("its columns: time, x, F")

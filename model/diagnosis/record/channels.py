@@ -11,7 +11,7 @@ from sprung.model.diagnosis.record.fused import FusedMotion
 from sprung.model.diagnosis.record.highpass import carries_everything, passed
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.slower import slower, slower_by
-from sprung.model.diagnosis.record.stretch import liveliest, standstill
+from sprung.model.diagnosis.record.stretch import at_rest, liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import ACCELERATION
 from sprung.model.schema import ForceInput, SupportInput, TrackInput
@@ -74,10 +74,13 @@ def _blank_unusable(
         f"input {name} is zero throughout: treated as no force" for name in sorted(resting) if _recorded(system, name)
     ]
     still = standstill(values, max(int(sample_rate), rules.stuck_samples), rules.resting)
+    if all(isinstance(source, SupportInput) for source in system.file.inputs.values()):  # no blow ends a rest
+        noise = np.array([channel.noise for channel in system.channels])
+        still |= at_rest(values, rules.moves * noise, max(int(rules.rest * sample_rate), rules.stuck_samples))
     if still.any() and not still.all():
         values[still] = np.nan
         notes.append(
-            f"standstill of {still.sum() / sample_rate:.1f} s is left out: the longest stretch that moves is used"
+            f"standstill of {still.sum() / sample_rate:.1f} s is left out; the longest stretch that moves is used"
         )
     steady = {"speed"} if system.on_track else set()  # may be constant for minutes
     return _blank_stuck(values, names, sample_rate, resting | steady, rules)
@@ -93,7 +96,8 @@ def _long_enough(values: FloatArray, sample_rate: float, notes: list[str], rules
         )
     if last - first < len(values):
         notes.append(
-            f"gaps too long to close: used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording"
+            f"used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording, the longest stretch "
+            "without standstill and gaps too long to close"
         )
     return first, last
 

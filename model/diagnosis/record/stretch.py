@@ -22,6 +22,27 @@ def standstill(values: FloatArray, least: int, share: float) -> BoolArray:
     return np.asarray(resting > share * present.sum())
 
 
+def at_rest(values: FloatArray, noise: FloatArray, least: int) -> BoolArray:
+    """Mask (T,) of the runs of `least` samples or more in which every channel (T, C) shows its noise (C,) alone.
+
+    noise: limit of a channel's deviation over a fifth of that time.  Missing samples count as the channel's median.
+    """
+    still = np.ones(len(values), dtype=bool)
+    span = max(least // 5, 2)
+    for series, limit in zip(values.T, noise, strict=True):
+        if np.isfinite(series).any():
+            moved = np.nan_to_num(series - np.nanmedian(series))
+            mean = uniform_filter1d(moved, span, mode="nearest")
+            power = uniform_filter1d((moved - mean) ** 2, span, mode="nearest")
+            still &= power < limit**2
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]])))
+    still[:] = False
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        if stop - start >= least:  # a stop is over within the time over which it is looked for
+            still[max(start - span, 0) : stop + span] = True
+    return still
+
+
 def liveliest(sensors: FloatArray, longest: int, shock: float = RULES.record.shock) -> tuple[int, int]:
     """The stretch of `longest` samples in which the sensors (T, S) move most, relative to their mean power.
 
