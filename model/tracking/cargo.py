@@ -39,6 +39,10 @@ class Cargo:
     past_at: IntArray  # ns, start of the last window that determined it, shape (L,); 0: never
     disputed: IntArray  # ns, start of the first window of those that contradict the believed loads; 0: none, shape (1,)
 
+    def shifted(self, by: int) -> Cargo:
+        """With the time since when loads are disputed later by `by`, ns."""
+        return replace(self, disputed=np.where(self.disputed != 0, self.disputed + by, 0))
+
 
 def start(prior_variance: FloatArray) -> Cargo:
     """Nothing seen yet; variances (L,) of the loads' logarithms before any window."""

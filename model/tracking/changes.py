@@ -43,6 +43,10 @@ class Changes:
         with np.errstate(divide="ignore"):
             return np.where(self.weight > 0, 1.0 / self.weight, np.inf)
 
+    def shifted(self, by: int) -> Changes:
+        """With times that are later by `by`, ns."""
+        return replace(self, up_since=self.up_since + by, down_since=self.down_since + by)
+
 
 def start(shape: tuple[int, ...]) -> Changes:
     zeros = np.zeros(shape)

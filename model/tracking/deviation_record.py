@@ -42,6 +42,11 @@ class DeviationRecord:
         """Log-likelihood ratio of a jump along each direction, shape (V,)."""
         return np.asarray(self.slope**2 / (2 * np.maximum(self.curvature, 1e-12)))
 
+    def shifted(self, by: int) -> DeviationRecord:
+        """With times that are later by `by`, ns."""
+        recent = np.where(self.recent != 0, self.recent + by, 0)
+        return replace(self, since=self.since + by, recent=recent)
+
     def lag(self, model: DeviationModel) -> FloatArray:
         """How far the last windows lie beyond what is believed, along each direction, shape (V,)."""
         return np.asarray(self.trend / (self.trend_curvature + 1 / model.prior_along))

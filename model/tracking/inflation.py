@@ -7,7 +7,7 @@ never compared across that minute.  Arrays are (..., P): one vehicle, or many at
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,10 @@ class VarianceInflation:
     def factor(self) -> FloatArray:
         """Factor on the windows' variances; never below 1, since luck is not precision."""
         return np.maximum(1.0, self.square)
+
+    def shifted(self, by: int) -> VarianceInflation:
+        """With times that are later by `by`, ns."""
+        return replace(self, anchored=self.anchored + by)
 
 
 def start(shape: tuple[int, ...]) -> VarianceInflation:

@@ -24,6 +24,11 @@ class MisfitFloor:
     rising_since: int = 0  # ns, when the statistic last left zero
     misfit_since: int | None = None  # ns; None: windows fit
 
+    def shifted(self, by: int) -> MisfitFloor:
+        """With times that are later by `by`, ns."""
+        since = None if self.misfit_since is None else self.misfit_since + by
+        return replace(self, rising_since=self.rising_since + by, misfit_since=since)
+
 
 def update(
     fit: MisfitFloor,

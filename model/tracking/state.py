@@ -75,6 +75,10 @@ class Stuck:
     since: int  # ns
     unseen: tuple[str, ...] = ()  # parameters that no window has identified without it
 
+    def shifted(self, by: int) -> Stuck:
+        """With its time later by `by`, ns."""
+        return replace(self, since=self.since + by)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackerState:
@@ -113,6 +117,21 @@ class TrackerState:
     def misfit_since(self) -> int | None:
         """ns since when windows don't fit; None while they do."""
         return self.fit.misfit_since
+
+    def shifted(self, by: int) -> TrackerState:
+        """As if all windows had come later by `by`, ns.  Alarms keep the times with which they were reported."""
+        return replace(
+            self,
+            time=None if self.time is None else self.time + by,
+            last=None if self.last is None else self.last + by,
+            inflation=self.inflation.shifted(by),
+            changes=self.changes.shifted(by),
+            fit=self.fit.shifted(by),
+            calibration=self.calibration.shifted(by),
+            stuck=tuple(stuck.shifted(by) for stuck in self.stuck),
+            weather=None if self.weather is None else self.weather.shifted(by),
+            cargo=None if self.cargo is None else self.cargo.shifted(by),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; arrays as base64 of little-endian bytes, so that nothing is rounded."""

@@ -226,35 +226,7 @@ class Tracker:
         """
         if state.time is None or time_ns > state.time:
             return state
-        shift = time_ns - nanoseconds(self.settings.hop) - state.time
-        changes, fit, calibration = state.changes, state.fit, state.calibration
-        used = calibration.recent != 0
-        weather = state.weather
-        if weather is not None:
-            weather = replace(weather, began=np.where(weather.began != 0, weather.began + shift, 0))
-        cargo = state.cargo
-        if cargo is not None:
-            cargo = replace(cargo, disputed=np.where(cargo.disputed != 0, cargo.disputed + shift, 0))
-        return replace(
-            state,
-            time=state.time + shift,
-            last=None if state.last is None else state.last + shift,
-            inflation=replace(state.inflation, anchored=state.inflation.anchored + shift),
-            changes=replace(changes, up_since=changes.up_since + shift, down_since=changes.down_since + shift),
-            fit=replace(
-                fit,
-                rising_since=fit.rising_since + shift,
-                misfit_since=None if fit.misfit_since is None else fit.misfit_since + shift,
-            ),
-            calibration=replace(
-                calibration,
-                since=calibration.since + shift,
-                recent=np.where(used, calibration.recent + shift, 0),
-            ),
-            stuck=tuple(replace(s, since=s.since + shift) for s in state.stuck),
-            weather=weather,
-            cargo=cargo,
-        )
+        return state.shifted(time_ns - nanoseconds(self.settings.hop) - state.time)
 
     def update_many(self, state: TrackerState, windows: Iterable[tuple[Estimate, int]]) -> TrackerState:
         """`update` over windows in their order."""

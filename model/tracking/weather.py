@@ -88,6 +88,10 @@ class Weather:
     warmth: FloatArray  # the last temperature that was measured, 10 K; NaN: none, shape (1,)
     shared: FloatArray  # correlation of what windows have in common with that in the baseline, shape (1,)
 
+    def shifted(self, by: int) -> Weather:
+        """With times that are later by `by`, ns."""
+        return replace(self, began=np.where(self.began != 0, self.began + by, 0))
+
 
 def model_of(
     names: Sequence[str],
