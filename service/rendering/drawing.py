@@ -105,7 +105,7 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
     short = short_names(system.elements)
     parts = [_open(found.width, height, f"{system.name} from the side: springs, dampers and sensors with their states")]
     tops = {name: foot - level * STOREY - (level - 1) * THICKNESS - THICKNESS for name, level in layout.level.items()}
-    parts += _ground(found, foot)
+    parts += _ground(found, foot, sensors)
     for name in sorted(file.bodies, key=lambda body: layout.level[body]):
         parts.append(_body(found, name, tops[name]))
     spans = {name: _span(file.elements[name].upper, file.elements[name].lower, tops, foot) for name in system.elements}
@@ -255,17 +255,29 @@ def _sensor(name: str, short: str, across: float, top: float, sensors: Mapping[s
     )
 
 
-def _ground(found: DrawingColumns, foot: float) -> list[str]:
+def _ground(found: DrawingColumns, foot: float, sensors: Mapping[str, Mark]) -> list[str]:
+    """Wheels, or the tables of a rig, with what is wrong with the channels that measure their motion."""
     layout, parts = found.layout, []
     supports = {name for name, source in layout.system.file.inputs.items() if not isinstance(source, ForceInput)}
     for name, item in layout.system.file.elements.items():
         if not {item.upper, item.lower} & supports:
             continue
         across = found.across(*layout.element_position(name))
+        wrong = {
+            channel: mark
+            for channel, mark in sensors.items()
+            if channel.split(".")[0] in {item.upper, item.lower} & supports
+        }
+        state = "".join(f" {mark.state}" for mark in list(wrong.values())[:1])
+        title = f"<title>{escape('; '.join(mark.words(channel) for channel, mark in wrong.items()))}</title>"
+        inside = title if wrong else ""
         if layout.railway:
-            parts.append(f'<circle class="wheel" cx="{across:.1f}" cy="{foot + WHEEL:.1f}" r="{WHEEL}"/>')
+            parts.append(
+                f'<circle class="wheel{state}" cx="{across:.1f}" cy="{foot + WHEEL:.1f}" r="{WHEEL}">{inside}</circle>'
+            )
         else:  # a test rig: a table that is moved up and down
-            parts.append(f'<rect class="table" x="{across - 30:.1f}" y="{foot:.1f}" width="60" height="12"/>')
+            box = f'x="{across - 30:.1f}" y="{foot:.1f}" width="60" height="12"'
+            parts.append(f'<rect class="table{state}" {box}>{inside}</rect>')
             parts.append(f'<path class="arrow" d="M{across:.1f},{foot + 16:.1f}v22m-4,-18l4,-5l4,5m-8,14l4,5l4,-5"/>')
     floor = foot + 2 * WHEEL if layout.railway else foot + WHEEL * 2 + 4
     if not supports:

@@ -4,10 +4,14 @@ const acts = (() => {
   const key = () => (crypto.randomUUID ? crypto.randomUUID() : String(Math.random()).slice(2) + Date.now());
   const csrf = () => document.querySelector('meta[name="csrf"]')?.content;
 
+  const ask = (url, how) => fetch(url, how).catch(() => {  // what browsers say of it, "Failed to fetch", helps nobody
+    throw new Error("The service does not answer. Try again when it is back.");
+  });
+
   async function send(method, url, body) {
     const headers = { "content-type": "application/json", "idempotency-key": key() };
     if (csrf()) headers["x-csrf-token"] = csrf();
-    const answer = await fetch(url, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
+    const answer = await ask(url, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) });
     const found = answer.status === 204 ? {} : await answer.json().catch(() => ({}));
     if (!answer.ok) throw new Error(found.detail || answer.statusText);
     return found;
@@ -15,7 +19,7 @@ const acts = (() => {
 
   async function follow(job, show) {
     for (;;) {
-      const now = await (await fetch(`/jobs/${job}`)).json();
+      const now = await (await ask(`/jobs/${job}`)).json();
       show(now);
       if (now.state === "done" || now.state === "failed") return now;
       await new Promise((wait) => setTimeout(wait, 1000));

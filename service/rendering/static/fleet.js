@@ -12,7 +12,7 @@
     const focused = document.activeElement && document.activeElement.id;
     list.replaceChildren(...page.getElementById("list").childNodes);
     if (focused && document.getElementById(focused)) document.getElementById(focused).focus();
-    status.textContent = "Live; last change " + new Date().toLocaleTimeString();
+    status.textContent = `Live; last change ${new Date().toISOString().slice(11, 19)} UTC`;
   }
   function later() {
     if (waiting) return;

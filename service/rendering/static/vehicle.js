@@ -362,7 +362,7 @@
     }
     Object.assign(data, JSON.parse(page.getElementById("data").textContent));
     if (!document.querySelector("dialog[open]")) load();
-    at("status").textContent = `Live; ${new Date().toLocaleTimeString()}`;
+    at("status").textContent = `Live; last change ${new Date().toISOString().slice(11, 19)} UTC`;
   }
   const news = new EventSource(`/events?vehicle=${encodeURIComponent(data.vehicle)}`);
   news.addEventListener("vehicle", () => {

@@ -389,6 +389,21 @@ def test_a_test_rig_is_not_drawn_as_a_railway_vehicle(system: System) -> None:
     assert "strut: not estimated" not in plan_view(rig, {"strut.stiffness": Mark("ok")})
 
 
+def test_a_wheel_whose_motion_is_measured_wrongly_is_marked(system: System) -> None:
+    drawn = side_view(system, {}, {"wheel_21r.displacement": Mark("suspect"), "wheel_11l.velocity": Mark("absent")})
+    assert drawn.count('class="wheel"') == 6
+    suspect, absent = drawn.index('class="wheel suspect"'), drawn.index('class="wheel absent"')
+    assert "wheel_21r.displacement: suspect" in drawn[suspect : suspect + 200].lower()
+    assert "<title>wheel_11l.velocity" in drawn[absent : absent + 200]
+
+
+def test_pages_show_one_kind_of_time_and_say_that_the_service_is_away() -> None:
+    static = Path(__file__).parents[3] / "service" / "rendering" / "static"
+    scripts = {path.name: path.read_text() for path in static.glob("*.js")}
+    assert not [name for name, text in scripts.items() if "toLocale" in text]
+    assert scripts["acts.js"].count("fetch(") == 1 and "The service does not answer" in scripts["acts.js"]
+
+
 QUARTER = (Path(__file__).parents[3] / "docs" / "tutorial.md").read_text().split("`quarter.yaml`:\n\n```yaml\n")[1]
 
 
