@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sprung.model.diagnosis.investigation.measurements.calibration import calibration_indices, faulty, within_tolerance
+from sprung.model.diagnosis.investigation.measurements.calibration import calibration_indices, faulty
+from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
 from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import IdentifiedLaw
 from sprung.model.diagnosis.report.values import input_fault_parameter, law_parameters

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
-from sprung.model.diagnosis.investigation.measurements.calibration import faulty, within_tolerance
+from sprung.model.diagnosis.investigation.measurements.calibration import faulty
+from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
 from sprung.model.diagnosis.investigation.state import AcceptedFinding, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.verdict import kind_of
 from sprung.model.diagnosis.kinds import EffectKind

@@ -8,7 +8,8 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.configuration.effects import WRONG_BODY
-from sprung.model.diagnosis.investigation.measurements.calibration import faulty, within_tolerance
+from sprung.model.diagnosis.investigation.measurements.calibration import faulty
+from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
 from sprung.model.diagnosis.investigation.measurements.floor import bounded, held_out_errors
 from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of

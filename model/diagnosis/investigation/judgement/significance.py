@@ -17,12 +17,8 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import settled
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.judgement.misfit_covariance import misfit_covariance
-from sprung.model.diagnosis.investigation.measurements.calibration import (
-    calibration_indices,
-    is_gain,
-    shared_gain,
-    within_tolerance,
-)
+from sprung.model.diagnosis.investigation.measurements.calibration import calibration_indices, is_gain, shared_gain
+from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
 from sprung.model.diagnosis.investigation.measurements.floor import leaves_more_than_noise
 from sprung.model.diagnosis.investigation.search.redundant import without
 from sprung.model.diagnosis.investigation.state import Investigation

@@ -7,7 +7,7 @@ is most often wrong in, so that all of them and the instruments are tried togeth
 
 from __future__ import annotations
 
-from sprung.model.diagnosis.investigation.measurements.calibration import calibration_terms
+from sprung.model.diagnosis.investigation.measurements.data_sheets import calibration_terms
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.selection.compete import Trial, gain_together
 

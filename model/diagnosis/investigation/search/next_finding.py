@@ -13,10 +13,10 @@ from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.formula.trial import with_formula
 from sprung.model.diagnosis.investigation.measurements.calibration import (
     calibrated,
-    may_be_calibration,
     with_free_gains,
     without_calibrations,
 )
+from sprung.model.diagnosis.investigation.measurements.data_sheets import may_be_calibration
 from sprung.model.diagnosis.investigation.search.along_motion import law_along_motion
 from sprung.model.diagnosis.investigation.search.masses import imitates_errors
 from sprung.model.diagnosis.investigation.search.minor import is_minor, sought, untried

@@ -12,7 +12,7 @@ from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.measurements import calibration
-from sprung.model.diagnosis.investigation.measurements.calibration import within_tolerance
+from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import find_law
