@@ -16,7 +16,7 @@ from sprung.model.signals import ANY_TIME, FloatArray, IntArray, TimeColumn
 from sprung.replay.account import Account
 from sprung.replay.listing import NO_TIME, signals_of
 from sprung.replay.recording import open_recording
-from sprung.replay.sampling import sampling_clock
+from sprung.replay.sampling import LOST, sampling_clock
 
 MOST_SAMPLES = 40_000_000  # of all channels together that are kept; of longer recordings the first part is looked at
 GAP = 2.5  # periods without a sample
@@ -48,6 +48,7 @@ class Signal:
     band: tuple[float, float] | None = None  # Hz between which 90 % of the power about the mean lie
     peak: float | None = None  # Hz, where the spectrum is highest
     gaps: int = 0
+    lost: int = 0  # samples, where their times show it
     longest_gap: float = 0.0  # s
     duplicate_times: int = 0  # samples at the time of the one before
     standstill: list[tuple[float, float]] = field(default_factory=list)
@@ -143,14 +144,34 @@ def look(name: str, address: dict[str, str], unit: str | None, time: IntArray, v
     found = sampling_clock(time)
     if found is None:
         return signal
-    signal.rate = 1.0 / found.period
-    signal.jitter = found.jitter if np.isfinite(found.jitter) else None
-    wide = steps > GAP * found.period
+    period, jitter = found.period, found.jitter
+    counted = _counted_clock(elapsed)
+    if counted is not None and not jitter < counted[1] + LOST:  # stamps leave an even clock where samples are missing
+        period, jitter, signal.lost = counted
+    signal.rate = 1.0 / period
+    signal.jitter = jitter if np.isfinite(jitter) else None
+    wide = steps > GAP * period
     signal.gaps, signal.longest_gap = int(wide.sum()), float(steps[wide].max()) if wide.any() else 0.0
     stretch = _longest(wide)
     _spectrum(signal, value[stretch])
-    signal.standstill = _standstill(elapsed, value, found.period, signal.noise or 0.0)
+    signal.standstill = _standstill(elapsed, value, period, signal.noise or 0.0)
     return signal
+
+
+def _counted_clock(elapsed: FloatArray) -> tuple[float, float, int] | None:
+    """Period, s, scatter about it in periods, and lost samples of stamps (T,) whose usual step tells how many are lost.
+
+    None where none are, or where the steps are no multiples of a usual one.
+    """
+    steps = np.diff(elapsed)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if not usual > 0.0:
+        return None
+    number = np.r_[0, np.cumsum(np.maximum(np.rint(steps / usual), 1.0))]
+    lost = int(number[-1]) - len(steps)
+    period, start = (float(c) for c in np.polyfit(number, elapsed, 1))
+    scatter = float(np.std(elapsed - start - period * number)) / period
+    return (period, scatter, lost) if lost and scatter < LOST else None
 
 
 def _rises_evenly(value: FloatArray) -> bool:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import unicodedata
+import zlib
 
 from sprung.model.units import FACTORS, known
 from sprung.replay.inspection import Inspection, Signal
@@ -21,6 +23,9 @@ WORDS = {  # in names of signals without a unit
     "force": ("force", "forc", "kraft", "load", "cell", "f"),
 }
 PLAIN = re.compile(r"^[A-Za-z/][\w/.-]*$")
+LETTERS = str.maketrans(
+    {"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "µ": "u", "μ": "u"}
+)
 YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 OVERSAMPLED = 10.0  # times the highest frequency that matters, beyond which a lower rate is proposed
 FINE = 100.0  # the same of a component test: friction and stops are identified within a cycle
@@ -188,7 +193,10 @@ def _identifier(name: str) -> str:
     if len(parts) == 2 and parts[1].startswith(parts[0]):  # a CAN signal that repeats its message's name
         parts = parts[1:]
     spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", "_".join(parts))
-    short = re.sub(r"\W+", "_", spaced, flags=re.ASCII).strip("_").lower()
+    letters = unicodedata.normalize("NFKD", spaced.translate(LETTERS))
+    short = re.sub(r"[\W_]+", "_", letters, flags=re.ASCII).strip("_").lower()
+    if any(letter.isalpha() and not letter.isascii() for letter in letters):  # another alphabet's: only told apart
+        short = f"{short}_{zlib.crc32(name.encode()):08x}".strip("_")
     return short if re.match(r"[a-z_]", short) else f"signal_{short}"
 
 

@@ -118,6 +118,8 @@ def _of(s: Signal) -> list[str]:
         return [f"always {s.minimum:g}"]
     if s.missing:
         out.append(f"{s.missing} of {s.samples} values are missing")
+    if s.lost:
+        out.append(f"{s.lost} samples lost of {s.samples + s.lost}")
     if s.gaps:
         out.append(f"{s.gaps} gaps, the longest of {s.longest_gap:.3g} s")
     if s.duplicate_times:

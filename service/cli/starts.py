@@ -18,4 +18,7 @@ def start_time(text: str | None, files: Sequence[Path]) -> int | None:
     try:
         return from_iso(text)
     except (ValueError, OverflowError):
-        raise UserError(f"--start {text!r}: a time such as 2026-09-21T14:13:20Z is expected") from None
+        raise UserError(
+            f"--start {text!r}: a time with its zone is expected, such as 2026-09-21T14:13:20Z "
+            "or 2026-09-21T16:13:20+02:00"
+        ) from None

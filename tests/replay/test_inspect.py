@@ -212,3 +212,34 @@ def test_wrong_options_are_one_line(ride: Path, capfd: pytest.CaptureFixture[str
         err = capfd.readouterr().err
         assert words in err
         assert len(err.splitlines()) == 1
+
+
+def test_lost_rows_between_uneven_stamps_are_counted_and_do_not_lower_the_rate() -> None:
+    rng = np.random.default_rng(8)
+    kept = rng.random(20_000) > 0.02
+    time = 1_790_000_000 + (np.arange(20_000) / 200 + rng.uniform(-1e-3, 1e-3, 20_000))[kept]
+    value = np.sin(np.arange(20_000) / 30)[kept]
+    stamps = np.rint((time - time[0]) * 1e9).astype(np.int64)
+    found = look("a", {}, None, stamps, value, 0)
+    assert found.rate == pytest.approx(200.0, rel=1e-5)
+    assert found.lost == np.flatnonzero(kept)[-1] - np.flatnonzero(kept)[0] + 1 - kept.sum()
+    assert found.jitter == pytest.approx(0.2 / np.sqrt(3), rel=0.05)  # even within a millisecond either way
+    whole = look("a", {}, None, np.arange(20_000) * 5_000_000, np.sin(np.arange(20_000) / 30), 0)
+    assert whole.lost == 0 and whole.rate == pytest.approx(200.0)
+
+
+def test_names_of_a_skeleton_are_spelt_in_plain_letters(tmp_path: Path) -> None:
+    path = tmp_path / "fahrt.csv"
+    names = ["Straße z [µm]", "Größe à v [m/s]", "加速度 [g]", "力 [g]"]
+    rows = [[i / 100, *(np.sin(i / (7 + k)) for k in range(4))] for i in range(500)]
+    path.write_text("t;" + ";".join(names) + "\n" + "\n".join(";".join(f"{v:.6f}" for v in row) for row in rows))
+    assert main(["inspect", str(path), "--write-system", str(tmp_path / "s.yaml")]) == 0
+    sensors = list(load_system(tmp_path / "s.yaml").sensors)
+    assert sensors[:2] == ["strasse_z_um", "groesse_a_v_m_s"] and len(set(sensors)) == 4
+
+
+def test_a_start_without_a_zone_is_refused_with_two_that_have_one(
+    ride: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", str(ride), "--start", "2026-09-21T14:13:20"]) == 2
+    assert "with its zone" in capsys.readouterr().err
