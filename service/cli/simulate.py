@@ -11,7 +11,7 @@ import numpy as np
 from sprung.model.laws import CATALOGUE, Law
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import MANCHESTER, load_system
-from sprung.model.text import counted
+from sprung.model.text import counted, some
 from sprung.replay.record import Record
 from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
 from sprung.service.can_database import database_of
@@ -54,6 +54,9 @@ def simulate(
         f"{out}: {counted(len(values), 'sample')} of {counted(len(system.channels), 'channel')}; laws: {laws}",
         file=sys.stderr,
     )
+    if system.auxiliary:
+        names = some([channel.name for channel in system.auxiliary], 5)
+        print(f"sprung: {out}: holds inputs and sensors alone, not {names}", file=sys.stderr)
     return 0
 
 

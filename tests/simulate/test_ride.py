@@ -199,3 +199,19 @@ def test_simulate_then_compare_on_the_command_line(tmp_path: Path, capsys: pytes
     assert errors["friction"] < 0.1 * errors["plain"]
     assert main(["compare", ride, ride, "--system", of, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["nrmse"] == 0
+
+
+def test_signals_that_a_simulated_recording_lacks_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "car.yaml"
+    file.write_text(
+        "name: car\nsample_rate: 100\nwindow: 100\nspeed: {csv: v}\ntemperature: {csv: T}\nbodies:\n"
+        "  body: {mass: 400}\ninputs:\n  road: {kind: support, displacement: {csv: z}, velocity: {csv: w}}\n"
+        "elements:\n  strut: {upper: body, lower: road, stiffness: 2.0e+4, damping: 1500}\n"
+        "sensors:\n  top: {kind: acceleration, body: body, csv: a}\n"
+    )
+    rows = [f"{i / 100:.2f},{np.sin(i / 9):.6f},{11.1 * np.cos(i / 9):.6f},0,20,18" for i in range(600)]
+    (tmp_path / "in.csv").write_text("time,z,w,a,v,T\n" + "\n".join(rows) + "\n")
+    made = tmp_path / "out.csv"
+    assert main(["simulate", str(file), "--inputs", str(tmp_path / "in.csv"), "--out", str(made)]) == 0
+    assert "holds inputs and sensors alone, not speed, temperature" in capsys.readouterr().err
+    assert made.read_text().splitlines()[0] == "time,z,w,a"
