@@ -66,7 +66,7 @@ def _of_element(state: Investigation, term: Term, key: str) -> dict[str, NDArray
     by_rate = abs(_share(law, v)) > abs(_share(law, d)) if np.any(law) else False
     x = v if by_rate else d
     grid_x = _axis(x, 0.002)
-    mean, std, drawn = _binned(x, after + law, law, deviation, grid_x)
+    mean, std, drawn = binned(x, after + law, law, deviation, grid_x)
     result: dict[str, NDArray[Any]] = {
         f"{key}.time": time[thin],
         f"{key}.deflection": d[thin],
@@ -169,13 +169,18 @@ def _share(force: FloatArray, signal: FloatArray) -> float:
     return float(np.corrcoef(force, signal)[0, 1]) if np.std(signal) > 0 and np.std(force) > 0 else 0.0
 
 
-def _binned(
+def binned(
     x: FloatArray, force: FloatArray, law: FloatArray, deviation: float, grid: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean of the force over bins of x, its standard deviation, and the law's mean in the same bins."""
+    """Mean of the force (N,) over bins of x (N,), its standard deviation, and the law's mean in the same bins.
+
+    deviation: standard deviation of one sample of the force, N; grid: centres of the bins (m,), in ascending order.
+    Bins without a sample are NaN.
+    """
     edges = np.concatenate([[-np.inf], (grid[1:] + grid[:-1]) / 2, [np.inf]])
     which = np.digitize(x, edges) - 1
-    count = np.maximum(np.bincount(which, minlength=len(grid)), 1)
-    mean = np.bincount(which, force, len(grid)) / count
-    drawn = np.bincount(which, law, len(grid)) / count
-    return mean, deviation / np.sqrt(count) * 2.0, drawn
+    count = np.bincount(which, minlength=len(grid))
+    samples = np.where(count > 0, count, np.nan)
+    mean = np.bincount(which, force, len(grid)) / samples
+    drawn = np.bincount(which, law, len(grid)) / samples
+    return mean, deviation / np.sqrt(samples) * 2.0, drawn

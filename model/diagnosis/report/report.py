@@ -6,7 +6,8 @@ T: samples of the held-out part; S: sensors in the system's order; i: number of 
     validation.time (T,) s, validation.measured / .baseline / .augmented (T, S), validation.noise (S,)
     localization.names (L,), localization.score (L,)
     finding.i.time / .deflection / .rate / .force_before / .force_after (n,)
-    finding.i.curve_axis ("deflection" | "rate"), .curve_x / .curve_mean / .curve_std / .curve_law (m,)
+    finding.i.curve_axis ("deflection" | "rate"), .curve_x / .curve_mean / .curve_std / .curve_law (m,);
+        NaN where no sample lies
     finding.i.loop_x / .loop_y (p,)
     track.time (W,) s, track.frequency / .std (W, modes) Hz
     finding.i.map_d (a,), .map_v (b,), .map_force / .map_std (b, a)
