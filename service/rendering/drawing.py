@@ -18,6 +18,7 @@ from sprung.service.monitoring.views import LETTERS
 from sprung.service.report.layout import Layout, lay_out
 
 COLUMN, GAP, MARGIN = 70.0, 46.0, 64.0  # px
+LONGEST = 5  # letters of a name at the usual size
 STOREY, THICKNESS, WHEEL = 112.0, 34.0, 20.0
 LETTER = 8.0  # px, of a name
 SCALED = 700.0  # px: wider drawings are scaled down on phones, where their labels have to grow
@@ -93,6 +94,11 @@ def short_names(names: Iterable[str]) -> dict[str, str]:
         name: name.split("_", 1)[1] if "_" in name and heads.count(head) > 1 else name
         for name, head in zip(every, heads, strict=True)
     }
+
+
+def _named(short: str) -> str:
+    """The class of a name's text: one that is wider than its column at the usual size is written smaller."""
+    return "name long" if len(short) > LONGEST else "name"
 
 
 def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[str, Mark]) -> str:
@@ -232,7 +238,7 @@ def _element(name: str, short: str, across: float, head: float, base: float, par
         f'<g class="damper {damper.state}"><path d="M{x:.1f},{base:.1f}V{cup:.1f}M{x - 8:.1f},{top + 12:.1f}'
         f"V{cup:.1f}H{x + 8:.1f}V{top + 12:.1f}M{x - 6:.1f},{top + 20:.1f}H{x + 6:.1f}M{x:.1f},{top + 20:.1f}"
         f'V{head:.1f}"/></g>'
-        f'<text class="name" x="{across:.1f}" y="{head + 13:.1f}">{escape(short)}</text>'
+        f'<text class="{_named(short)}" x="{across:.1f}" y="{head + 13:.1f}">{escape(short)}</text>'
         + _said(spring, across - 16, base - (17 if damper.text else 5), "upper" if damper.text else "")
         + _said(damper, across + 16, base - 5)
         + "</a>"

@@ -397,6 +397,13 @@ def test_a_wheel_whose_motion_is_measured_wrongly_is_marked(system: System) -> N
     assert "<title>wheel_11l.velocity" in drawn[absent : absent + 200]
 
 
+def test_names_that_are_wider_than_their_column_are_written_smaller(system: System) -> None:
+    file = QUARTER.split("```")[0]
+    drawn = side_view(parse_system(file.replace("strut", "left_damper_strut")), {}, {})
+    assert 'class="name long"' in drawn and ">left_damper_strut<" in drawn
+    assert 'class="name long"' not in side_view(system, {}, {}) + plan_view(system, {})
+
+
 def test_pages_show_one_kind_of_time_and_say_that_the_service_is_away() -> None:
     static = Path(__file__).parents[3] / "service" / "rendering" / "static"
     scripts = {path.name: path.read_text() for path in static.glob("*.js")}
