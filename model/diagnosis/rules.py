@@ -224,6 +224,7 @@ class PlausibleRules:
     lines: int = rule(4, "of them at most; chosen", 2, 8)
     bins: int = rule(2, "on either side of a line; derived: they hold 92 % of a sine between two bins", 1, 4)
     harmonics: int = rule(30, "of a line that a non-linear answer may have; chosen", 15, 60)
+    mains: float = rule(0.15, "Hz, by which a mains frequency strays; derived: grids are kept within 0.1", 0.1, 0.3)
     apart: float = rule(3.0, "deviations from what it is without, of a gain or a mass; derived: one in 400", 2.0, 4.0)
     calibration: float = rule(
         1.5, "deviations of a data sheet, up to which a gain or zero is in order; chosen: 2.2 % by default", 1.0, 2.0
@@ -321,7 +322,7 @@ class NoiseRules:
     agree: float = rule(4.0, "deviations within which blocks agree with it; derived: one in 16 000", 3.0, 6.0)
     fall: float = rule(0.01, "of a force's noise power, that one round may leave; chosen: steps of ten", 0.003, 0.1)
     misdeclared: float = rule(
-        10.0, "times a declared noise, that a displacement may show; chosen: a slip of ten", 5.0, 20.0
+        10.0, "times a declared noise, that an instrument may show; chosen: a slip of ten", 5.0, 20.0
     )
     displacement: float = rule(
         0.5, "of the bins, informative on a support's displacement; derived: the fast half", 0.3, 0.7
@@ -423,7 +424,6 @@ class ComponentRules:
     starts: int = rule(2, "trial shapes from which a law is refined; chosen", 1, 4)
     close: int = rule(6, "laws that are refined in every round; chosen", 4, 10)
     declared: float = rule(0.02, "of the force, up to which a declared noise is believed; chosen", 0.01, 0.05)
-    misdeclared: float = rule(10.0, "times a declared noise, that an instrument has at most; chosen", 5.0, 20.0)
     surface_serves: float = rule(0.9, "of the held-out power that an unnamed force may leave; chosen", 0.8, 0.97)
     named: float = rule(0.8, "of the excess power; chosen: laws that leave more are not the component's", 0.6, 0.9)
     together: float = rule(

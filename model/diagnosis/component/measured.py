@@ -178,7 +178,7 @@ def _noise(measured: _Measured, rests: list[slice], run: slice, cell: Sensor, ru
     """
     force = without_motion(measured.force[run], measured.displacement[run], rules.white_noise)
     shown = max(noise_at_rest(measured.force, rests) or 0.0, white_noise(force, rules.white_noise))
-    return min(shown, rules.component.misdeclared * cell.noise) if cell.noise > 0 else shown
+    return min(shown, rules.noise.misdeclared * cell.noise) if cell.noise > 0 else shown
 
 
 @dataclass(frozen=True)

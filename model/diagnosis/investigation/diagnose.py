@@ -152,7 +152,12 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     # the floor may contain what the findings leave; where chi-square shows it, values include it all the same
     more = state.fit.reduced > noise_bound(state.problem, state.fit)
     if more or np.any(judgement.errors.unexplained(state.options.rules.verdict) > 0):
-        final = replace(final, covariance=final.covariance + misfit_covariance(state.problem, state.fit))
+        wider = misfit_covariance(state.problem, state.fit)
+        final = replace(final, covariance=final.covariance + wider)
+        # masses and instruments that are off by less than what is told of them are not faults either
+        told = (1 + moving) * state.fit.covariance + added + wider
+        state = replace(state, fit=replace(state.fit, covariance=told))
+        judgement = judged(state, before, after, noisy, ended)
     return Outcome(state, final, before, after, noisy, judgement)
 
 

@@ -19,6 +19,8 @@ from sprung.model.laws import BodyLaw, reversal_step
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
+_MAINS = (50.0, 60.0)  # Hz
+
 
 def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, before: Fit | None = None) -> str | None:
     """Reason to doubt a fitted term, in words; None if there is none.
@@ -34,7 +36,7 @@ def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, befo
         return _unresolved(fit, term, rules)
     if term.law.adds_motion:
         return _unheard(fit.forward.part.grid, term) or _too_slow(fit.forward.system, term, rules)
-    return harmonic(fit.forward.part, term, rules)
+    return harmonic(fit.forward.part, term, rules) or hum(fit.forward.part, term, rules)
 
 
 def _unheard(grid: Grid, term: Term) -> str | None:
@@ -140,6 +142,19 @@ def harmonic(part: Part, term: Term, rules: PlausibleRules = RULES.plausible) ->
             and abs(frequency - multiple * line) * part.grid.length < rules.close + 0.5 * multiple
         ):
             return f"{frequency:.4g} Hz is {multiple} times a frequency of the excitation, {line:.4g} Hz"
+    return None
+
+
+def hum(part: Part, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
+    """A periodic force or movement at a frequency of the mains, which instruments show without any force."""
+    if term.law.frequency is None or not term.law.drives:
+        return None
+    frequency = term.parameters[term.law.frequency]
+    for mains in _MAINS:
+        multiple = max(1, round(frequency / mains))
+        if abs(frequency - multiple * mains) < multiple * rules.mains + rules.close / part.grid.length:
+            times = "" if multiple == 1 else f"{multiple} times "
+            return f"{frequency:.4g} Hz is {times}that of the mains: instruments hum"
     return None
 
 

@@ -50,3 +50,14 @@ def test_values_that_still_move_are_less_sure(state: Investigation, monkeypatch:
     wider = 1 + moving.left  # whatever the level of the misfit: the covariance is that of noise alone
     assert moving.left == 8.0 * moving.grain
     np.testing.assert_allclose(np.diag(moving.covariance), wider * np.diag(whole.covariance))
+
+
+def test_what_is_off_by_less_than_what_is_told_of_it_is_judged_by_what_is_told(
+    state: Investigation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Masses and instruments are faults beyond their deviations: those that are reported, with what is unexplained."""
+    monkeypatch.setattr(diagnose, "noise_bound", lambda problem, fit: 0.0)
+    monkeypatch.setattr(diagnose, "misfit_covariance", lambda problem, fit: 9.0 * np.eye(len(fit.covariance)))
+    outcome = concluded(state, lambda share, text: None)
+    for told in (outcome.final, outcome.investigation.fit):
+        assert np.all(np.diag(told.covariance) >= 9.0)

@@ -17,6 +17,7 @@ from sprung.model.diagnosis.selection.plausible import (
     excitation_lines,
     hardly_there,
     harmonic,
+    hum,
     out_of_range,
 )
 from sprung.model.laws import find_law
@@ -62,6 +63,14 @@ def test_a_broad_excitation_has_no_harmonics() -> None:
     part: Any = Excited(np.cumsum(road), road)
     assert excitation_lines(part) == []
     assert harmonic(part, periodic(3.15)) is None
+
+
+@pytest.mark.parametrize(
+    ("frequency", "mains"), [(50.02, True), (59.95, True), (100.1, True), (25.0, False), (48.7, False), (0.1, False)]
+)
+def test_a_force_at_the_frequency_of_the_mains_may_be_hum_of_the_instruments(frequency: float, mains: bool) -> None:
+    part: Any = Excited(np.zeros(GRID.samples), np.zeros(GRID.samples))
+    assert ("mains" in (hum(part, periodic(frequency)) or "")) is mains
 
 
 @pytest.mark.parametrize("law", ["suspended_mass", "flexible_mode"])

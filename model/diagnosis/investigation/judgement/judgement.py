@@ -35,7 +35,7 @@ def judged(
     is then based on the unmeasured forces relative to the inertia forces.
     """
     rules = state.options.rules.verdict
-    noise = bounded(state)
+    noise = bounded(state, noisy)
     floor = state.held.noise_rms(state.fit, noise)
     errors = held_out_errors(before, after, floor, rules)
     lost = state.problem.process_noise and after.nrmse > rules.rejected

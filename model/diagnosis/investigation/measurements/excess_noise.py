@@ -68,6 +68,7 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     """Noise over declared noise (S,) above the compared band, up to where anti-alias filters cut, (S,).
 
     It is the residual's there, but at most the measured signal's: a wrong structure may resonate where nothing moves.
+    Nor does an instrument hum more than it shows in the held-out part, in which a rig may have come to rest.
     """
     grid, plant = state.problem.part.grid, state.fit.forward.plant
     upper = slice(grid.band.stop, int(state.options.rules.noise.upper * grid.samples))
@@ -77,6 +78,10 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     through = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support[upper]) ** 2, variance).mean(axis=0)
     residual, measured = state.fit.spectrum[upper], state.problem.part.sensors[upper]
     power = np.minimum(np.mean(np.abs(residual) ** 2, axis=0), np.mean(np.abs(measured) ** 2, axis=0))
+    later, end = state.held.later, int(state.options.rules.noise.upper * state.held.later.grid.samples)
+    beyond = later.sensors[later.grid.band.stop : end]
+    if len(beyond) >= state.options.rules.noise.bins:
+        power = np.minimum(power, np.mean(np.abs(beyond) ** 2, axis=0))
     found: np.ndarray = np.sqrt(np.maximum(power - through, 0.0)) / declared
     return found
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from sprung.model.diagnosis.investigation.measurements.excess_noise import upper_ratio
-from sprung.model.diagnosis.investigation.state import Investigation
+from sprung.model.diagnosis.investigation.state import Investigation, NoiseFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.rules import RULES, VerdictRules
@@ -29,17 +30,31 @@ def held_out_errors(before: FreeRun, after: FreeRun, floor: FloatArray, rules: V
     return HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after, rules))
 
 
-def bounded(state: Investigation) -> Noise:
-    """Noise levels for the floor: estimated ones, at most as declared or observed above the compared band."""
-    prepared = state.prepared.signals
-    declared = declared_noise(state.system, prepared, state.options.rules)
+def bounded(state: Investigation, noisy: Sequence[NoiseFault] = ()) -> Noise:
+    """Noise levels for the floor: estimated ones, at most as declared or observed above the compared band.
+
+    Friction, stops and what a rig is driven with move sensors there, too: what a file declares is believed to be wrong
+    by a slip of ten, and not by more.  noisy: sensors with a noise that only their peers speak against.
+    """
+    prepared, rules = state.prepared.signals, state.options.rules
+    declared = declared_noise(state.system, prepared, rules)
     present = np.isin(prepared.sensor_index, state.signals.sensor_index)
     known = declared.sensors[present]
-    seen = upper_ratio(state, known) * known
-    noise, slack = state.problem.noise, state.options.rules.verdict.slack
-    sensors = bounded_noise(noise.sensors, known, np.where(np.isfinite(seen), seen, 0.0), slack)
+    seen = upper_ratio(state, known)
+    seen = np.where(np.isfinite(seen), seen, 0.0)
+    bound = _declares(state, {fault.location for fault in noisy})
+    seen = np.where(bound, np.minimum(seen, rules.noise.misdeclared), seen) * known
+    noise, slack = state.problem.noise, rules.verdict.slack
+    sensors = bounded_noise(noise.sensors, known, seen, slack)
     force = bounded_noise(noise.force, declared.force, np.zeros(len(noise.force)), slack)
     return replace(noise, sensors=sensors, force=force)
+
+
+def _declares(state: Investigation, apart: Container[str]) -> np.ndarray:
+    """Whether the file declares the noise of the compared sensors, except of those named, (S,)."""
+    stated = list(state.system.file.sensors.values())
+    pairs = zip(state.signals.sensor_index.tolist(), state.signals.sensor_names, strict=True)
+    return np.array([stated[index].noise > 0 and name not in apart for index, name in pairs])
 
 
 def realised_floor(expected: FloatArray, after: FreeRun, rules: VerdictRules = RULES.verdict) -> FloatArray:

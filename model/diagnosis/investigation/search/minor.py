@@ -12,12 +12,12 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.compete import Trial
-from sprung.model.diagnosis.selection.plausible import harmonic
+from sprung.model.diagnosis.selection.plausible import harmonic, hum
 from sprung.model.laws import COMPRESSION, EXTENSION, BodyLaw, Law, StructureLaw
 
 
 def untried(state: Investigation, candidates: Iterable[Candidate]) -> list[Candidate]:
-    """Candidates to be tried: no input faults, not found before, and no harmonics of the excitation."""
+    """Candidates to be tried: no input faults, not found before, and no harmonics of the excitation or the mains."""
     return [
         h
         for h in sought(state, candidates)
@@ -25,6 +25,7 @@ def untried(state: Investigation, candidates: Iterable[Candidate]) -> list[Candi
         and not _repeats(state, h)
         and not _hopeless(state, h)
         and harmonic(state.problem.part, h.term, state.options.rules.plausible) is None
+        and hum(state.problem.part, h.term, state.options.rules.plausible) is None
     ]
 
 

@@ -1,5 +1,7 @@
 """Which channels count as noisier than their peers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,8 +14,8 @@ from sprung.model.diagnosis.investigation.measurements.excess_noise import (
     reaching_sensors,
     upper_ratio,
 )
-from sprung.model.diagnosis.investigation.measurements.floor import realised_floor
-from sprung.model.diagnosis.investigation.state import Options
+from sprung.model.diagnosis.investigation.measurements.floor import bounded, realised_floor
+from sprung.model.diagnosis.investigation.state import NoiseFault, Options
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.holdout import FreeRun
@@ -69,6 +71,31 @@ def test_resonances_of_a_wrong_structure_are_not_taken_for_noise() -> None:
     assert np.max(np.sqrt(np.mean(residual**2, axis=0)) / declared) > 10  # the fitted model is far off there
     ratio = upper_ratio(state, declared)  # a bound: some motion goes on above the band
     assert np.all(ratio > 0.9) and np.all(ratio < 2)
+
+
+def test_what_a_floor_takes_for_noise_is_no_more_than_a_declaration_may_be_wrong_by() -> None:
+    """Friction and stops shake sensors at all frequencies, as a broken instrument would."""
+    rig = building(3, "as stated", 3, 20.0)
+    declared = np.array([sensor.noise for sensor in rig.system.file.sensors.values()])
+    shaken = rig.values.copy()
+    shaken[:, -len(declared)] += 100 * declared[0] * np.random.default_rng(1).standard_normal(len(shaken))
+    state = begun(rig.system, replace(rig, values=shaken), Options(), lambda share, what: None)
+    name = state.signals.sensor_names[0]
+    most = RULES.noise.misdeclared * RULES.verdict.slack
+    assert state.problem.noise.sensors[0] > 50 * declared[0]
+    assert bounded(state).sensors[0] == pytest.approx(most * declared[0])
+    assert bounded(state, [NoiseFault(name, 100.0, 1.0, 1.0, 50.0, 0.0)]).sensors[0] > 50 * declared[0]
+
+
+def test_an_instrument_that_is_quiet_in_the_held_out_part_was_not_noisy_before() -> None:
+    """An earthquake's end: what shook a sensor at all frequencies has stopped."""
+    rig = building(3, "as stated", 3, 30.0)
+    declared = rig.system.file.sensors["a1"].noise
+    shaken, begins = rig.values.copy(), int(0.68 * len(rig.values))
+    shaken[:begins, 1] += 8 * declared * np.random.default_rng(1).standard_normal(begins)
+    state = begun(rig.system, replace(rig, values=shaken), Options(), lambda share, what: None)
+    assert state.problem.noise.sensors[0] > 6 * declared
+    assert bounded(state).sensors[0] < 3 * declared
 
 
 def test_a_floor_is_at_most_the_error_that_contains_it() -> None:
