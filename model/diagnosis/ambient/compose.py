@@ -94,40 +94,45 @@ def _values(system: System, pooled: PooledValues) -> tuple[ReportedParameter, ..
 def _findings(
     system: System, prepared: Prepared, windows: list[WindowResult], pooled: PooledValues, rules: AmbientRules
 ) -> list[Finding]:
-    found = [
-        Finding(
-            location=name,
-            effect=SENSOR_STUCK.name,
-            kind=kind_of(SENSOR_STUCK),
-            parameters=(),
-            p_value=None,
-            delta_bic=None,
-            sentence=f"{name}: repeats one value from {at:.2f} s on",
+    varying = [_varying(system, p, windows, pooled, rules) for p in np.flatnonzero(pooled.varying).tolist()]
+    return [_stuck(name, at) for name, at in prepared.stuck] + varying
+
+
+def _stuck(sensor: str, since: float) -> Finding:
+    """since: s of the recording."""
+    return Finding(
+        location=sensor,
+        effect=SENSOR_STUCK.name,
+        kind=kind_of(SENSOR_STUCK),
+        parameters=(),
+        p_value=None,
+        delta_bic=None,
+        sentence=f"{sensor}: repeats one value from {since:.2f} s on",
+    )
+
+
+def _varying(system: System, p: int, windows: list[WindowResult], pooled: PooledValues, rules: AmbientRules) -> Finding:
+    """Change of the p-th parameter, with its lowest and its highest value in windows that are sure of it."""
+    parameter = system.parameters[p]
+    sure = [w for w in windows if w.covariance[p, p] < rules.undetermined**2]
+    sure = [w for w in sure if w.adequate and w.covariance[p, p] < rules.sure**2] or sure
+    ends = [min(sure, key=lambda w: w.log_ratio[p]), max(sure, key=lambda w: w.log_ratio[p])]
+    low, high = (
+        LawParameter(
+            name,
+            parameter.nominal * float(np.exp(w.log_ratio[p])),
+            parameter.nominal * float(np.exp(w.log_ratio[p]) * np.sqrt(w.covariance[p, p])),
+            parameter.unit,
         )
-        for name, at in prepared.stuck
-    ]
-    for p in np.flatnonzero(pooled.varying):
-        parameter = system.parameters[int(p)]
-        sure = [w for w in windows if w.covariance[p, p] < rules.undetermined**2]
-        sure = [w for w in sure if w.adequate and w.covariance[p, p] < rules.sure**2] or sure
-        ends = [min(sure, key=lambda w: w.log_ratio[p]), max(sure, key=lambda w: w.log_ratio[p])]
-        low, high = (
-            LawParameter(
-                name,
-                parameter.nominal * float(np.exp(w.log_ratio[p])),
-                parameter.nominal * float(np.exp(w.log_ratio[p]) * np.sqrt(w.covariance[p, p])),
-                parameter.unit,
-            )
-            for name, w in zip(("lowest", "highest"), ends, strict=True)
-        )
-        sentence = (
-            f"{parameter.element}: its {parameter.quantity} changes during the recording, from {low.value:.5g} "
-            f"+- {low.std:.2g} {parameter.unit} at {ends[0].middle:.3g} s to {high.value:.5g} +- {high.std:.2g} "
-            f"{parameter.unit} at {ends[1].middle:.3g} s"
-        )
-        law, chance = VARYING[parameter.quantity], float(pooled.chance[p])
-        found.append(Finding(parameter.element, law.name, kind_of(law), (low, high), chance, None, sentence=sentence))
-    return found
+        for name, w in zip(("lowest", "highest"), ends, strict=True)
+    )
+    sentence = (
+        f"{parameter.element}: its {parameter.quantity} changes during the recording, from {low.value:.5g} "
+        f"+- {low.std:.2g} {parameter.unit} at {ends[0].middle:.3g} s to {high.value:.5g} +- {high.std:.2g} "
+        f"{parameter.unit} at {ends[1].middle:.3g} s"
+    )
+    law, chance = VARYING[parameter.quantity], float(pooled.chance[p])
+    return Finding(parameter.element, law.name, kind_of(law), (low, high), chance, None, sentence=sentence)
 
 
 def modes_at(system: System, log_ratio: FloatArray) -> list[Mode]:
