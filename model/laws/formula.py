@@ -27,8 +27,15 @@ def formula_law(
 ) -> ElementLaw:
     """The law with this force (N) and, where `memory` is not empty, this rate of its state z (zero at first).
 
-    Errors: `FormulaError` for text that is no formula, unknown names and parameters that nothing uses.
+    Errors: `FormulaError` for text that is no formula, unknown names, and parameters that nothing uses or that have
+    the name of a variable.
     """
+    taken = [name for name in parameters if name in MOTION]
+    if taken:
+        raise FormulaError(
+            f"formula {formula!r}: parameter {taken[0]!r} has the name of a variable ({', '.join(MOTION)}); "
+            "choose another"
+        )
     known = {*parameters, *MOTION}
     force = parse(formula, known)
     rate = parse(memory, known) if memory else None

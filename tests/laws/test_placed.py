@@ -71,6 +71,7 @@ def test_a_formula_is_a_law() -> None:
         ('[{formula: {formula: "a * q", a: 1}}]', "'q' is none of"),
         ('[{formula: {formula: "a * d", a: 1, b: 2}}]', "parameter 'b' is not used"),
         ('[{formula: {formula: "a * z", a: 1}}]', "give its rate as `memory`"),
+        ('[{formula: {formula: "c * d**3", c: 1.0e9}}]', "'c' has the name of a variable"),  # the element's damping
         ("[{coulomb_friction: {force: much, smoothing: 0.1}}]", "a number is expected, not 'much'"),
         ("[{bump_stop: {gap: 1, stiffness: 2}, clearance: {gap: 1}}]", "laws"),
     ],

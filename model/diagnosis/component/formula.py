@@ -25,7 +25,10 @@ from sprung.model.laws.grammar import Shape as Form
 from sprung.model.laws.grammar import forms, formula_cost, law_of
 from sprung.model.signals import FloatArray
 
-_OFF = 2.0  # factor to test whether a parameter is an amplitude
+_AMPLITUDES = ("a", "b")  # as the grammar names them
+# m and m/s, at which a formula is tested for being linear in its amplitudes: of the sizes of small and large motions.
+_DEFLECTIONS = np.outer([1e-4, 1e-3, 1e-2], [-1.0, -0.37, 0.0, 0.45, 1.1]).ravel()
+_RATES = np.outer([1e-3, 1e-2, 1e-1], [-0.9, -0.31, 0.0, 0.53, 1.3]).ravel()
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,8 @@ class FormulaPiece(Piece):
 
 
 def formula_piece(law: ElementLaw, grid: FloatArray | None = None, parts: int = 0) -> FormulaPiece:
-    """A formula whose parameters a, b, c are amplitudes; grid: trial values of the others, (trials, values)."""
-    amplitudes = [i for i, spec in enumerate(law.parameters) if spec.name in "abc"]
+    """A formula whose parameters a, b are amplitudes; grid: trial values of the others, (trials, values)."""
+    amplitudes = [i for i, spec in enumerate(law.parameters) if spec.name in _AMPLITUDES]
     others = [i for i in range(len(law.parameters)) if i not in amplitudes]
 
     def parameters(strengths: FloatArray, shape: Shape, element: SpringDamper) -> tuple[float, ...]:
@@ -75,19 +78,33 @@ def formula_piece(law: ElementLaw, grid: FloatArray | None = None, parts: int = 
 
 
 def given_piece(law: ElementLaw, values: Sequence[float]) -> FormulaPiece | None:
-    """A formula of a system file; None: one with a state, or not linear in amplitudes a, b, c."""
+    """A formula of a system file; None: one with a state, or not linear in amplitudes a, b."""
     piece = formula_piece(law)
     if not piece.signs or law.memory:
         return None
-    d, v = np.linspace(-1e-3, 1.1e-3, 7), np.linspace(0.013, -0.01, 7)
-    shape = piece.shape_of(values)
+    amplitudes = np.array([values[i] for i, spec in enumerate(law.parameters) if spec.name in _AMPLITUDES])
+    return piece if _is_linear(law, piece, amplitudes, piece.shape_of(values)) else None
+
+
+def _is_linear(law: ElementLaw, piece: FormulaPiece, amplitudes: FloatArray, shape: Shape) -> bool:
+    """Whether a force is a sum of amplitudes (n,) times shapes; max(a * d, b * v) scales with both and is none.
+
+    shape: the other parameters.
+    """
+    d, v = np.meshgrid(_DEFLECTIONS, _RATES)
 
     def force(strengths: FloatArray) -> FloatArray:
-        numbers = piece.parameters(strengths, shape, UNIT_ELEMENT)
-        return np.asarray(law.force(Motion(d, v, 0.0, ()), numbers, UNIT_ELEMENT), dtype=float)
+        found = law.force(Motion(d, v, 0.0, ()), piece.parameters(strengths, shape, UNIT_ELEMENT), UNIT_ELEMENT)
+        return np.asarray(found, dtype=float)
 
-    one = np.array([values[i] for i, spec in enumerate(law.parameters) if spec.name in "abc"])
-    return piece if np.allclose(force(_OFF * one), _OFF * force(one), rtol=1e-9, atol=1e-12) else None
+    with np.errstate(all="ignore"):  # what has no force at some motion is compared at the others
+        columns = np.array([force(unit) for unit in np.eye(len(amplitudes))])
+        defined = np.isfinite(columns).all(axis=0)
+        trials = [amplitudes, -amplitudes, *(amplitudes * (1 + 2 * np.eye(len(amplitudes))))]
+        return bool(defined.any()) and all(
+            np.allclose(force(trial)[defined], np.tensordot(trial, columns, 1)[defined], rtol=1e-9, atol=1e-12)
+            for trial in trials
+        )
 
 
 def formula_search(task: ComponentTask, given: ComponentModel) -> Search | None:
@@ -151,7 +168,7 @@ def _is_determined(one: Ranked, rules: ComponentRules) -> bool:
     index = len(one.fit.model.pieces) - 1
     sigma, _ = spread(one.fit, index, *covariance(one.fit))
     named = zip(one.fit.values(index).items(), sigma, strict=True)
-    return all(abs(value) > rules.formula_significant * s for (name, (value, _)), s in named if name in "abc")
+    return all(abs(value) > rules.formula_significant * s for (name, (value, _)), s in named if name in _AMPLITUDES)
 
 
 def _observed(task: ComponentTask) -> Observed:
