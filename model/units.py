@@ -8,6 +8,7 @@ Exact values: BIPM, The International System of Units, 9th edition; NIST Special
 from __future__ import annotations
 
 import difflib
+from itertools import chain
 
 G = 9.80665  # m/s^2, standard gravity
 INCH, FOOT, MILE = 0.0254, 0.3048, 1609.344  # m
@@ -80,6 +81,19 @@ def known(unit: str, si: str) -> str | None:
     if si == "kg" and spelt(unit).lower() in ("lb", "lbs"):
         return "lb"
     return None
+
+
+def confusion(ratio: float, si: str, tolerance: float = 0.005) -> str | None:
+    """Which units were taken for each other where values in `si` are wrong by a factor; None where no two explain it.
+
+    >>> confusion(0.10197, "m/s^2"), confusion(1000.2, "m"), confusion(0.5, "N")
+    ('g taken for m/s^2', 'mm taken for m', None)
+    """
+    others = [(name, factor) for name, factor in units_of(si).items() if factor != 1.0]
+    # a unit that the system file passes over is likelier than one that it states wrongly
+    passed = (f"{name} taken for {si}" for name, factor in others if abs(ratio * factor - 1.0) < tolerance)
+    stated = (f"{si} taken for {name}" for name, factor in others if abs(ratio / factor - 1.0) < tolerance)
+    return next(chain(passed, stated), None)
 
 
 def to_si(unit: str | None, si: str, scale: float | None, offset: float, sign: int) -> tuple[float, float]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.investigation.configuration.effects import WRONG_SCALE
 from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
 from sprung.model.diagnosis.investigation.measurements.calibration import faulty
 from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
@@ -21,15 +22,16 @@ from sprung.model.diagnosis.selection.compete import unnamed_alike
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.system import System
+from sprung.model.units import confusion
 
 
 def findings_of(outcome: Outcome) -> list[Finding]:
     """Findings, strongest first: stuck channels, then by the reduction of chi-square."""
     state, judgement = outcome.investigation, outcome.judgement
     if judgement.rejected:
-        return [_setup_finding(fault) for fault in state.setup_faults if fault.effect.model_free]
+        return [setup_finding(state.system, fault) for fault in state.setup_faults if fault.effect.model_free]
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in state.prepared.stuck]
-    ranked += [(np.inf, _setup_finding(f)) for f in state.setup_faults]
+    ranked += [(np.inf, setup_finding(state.system, f)) for f in state.setup_faults]
     ranked += [
         (f.score, _input_finding(state.system, f)) for f in state.input_faults if not within_tolerance(state, f.term)
     ]
@@ -179,12 +181,16 @@ def _input_finding(system: System, fault: InputFault) -> Finding:
     )
 
 
-def _setup_finding(fault: SetupFault) -> Finding:
+def setup_finding(system: System, fault: SetupFault) -> Finding:
     parameters: tuple[LawParameter, ...] = ()
     if fault.value is not None and fault.effect.parameter is not None:
         name, unit = fault.effect.parameter
         parameters = (LawParameter(name, fault.value, fault.std, unit),)
     sentence = fault.effect.describe(fault.site, parameters[0].words() if parameters else "")
+    if fault.effect is WRONG_SCALE and fault.value is not None:
+        units = {channel.unit for channel in system.channels if channel.name in fault.site.location.split("|")}
+        confused = confusion(abs(fault.value), units.pop()) if len(units) == 1 else None
+        sentence += f", as of {confused}" if confused else ""
     share = 100 * (1 - fault.after / fault.before)
     gone = f"; put right, {share:.0f} % of the misfit goes" if share >= 1 else ""
     return Finding(

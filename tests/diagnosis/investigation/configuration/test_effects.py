@@ -29,10 +29,12 @@ from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.report.compose import places_put_right
+from sprung.model.diagnosis.report.findings import setup_finding
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.damping import COULOMB_FRICTION
 from sprung.model.system import System, load_system, parse_system
+from sprung.model.units import confusion
 from tests.diagnosis_cases import quarter_car, simulate
 
 
@@ -106,3 +108,13 @@ def test_an_element_is_never_taken_to_end_at_a_measured_force() -> None:
 def test_what_has_no_value_is_not_undone_by_one() -> None:
     with pytest.raises(AssertionError, match="has no value"):
         SIGN_REVERSED.undone(SetupPlace("car_a"), 1.0)
+
+
+def test_a_wrong_scale_says_which_units_it_would_be() -> None:
+    system = quarter_car()
+    for ratio, said in ((1 / 9.80665, "as of g taken for m/s^2"), (-1000.0, "as of mm/s^2 taken for m/s^2")):
+        fault = SetupFault(WRONG_SCALE, SetupPlace("car_a|car_b"), ratio, 1e-4, 1.0, 0.1)
+        assert said in setup_finding(system, fault).sentence
+    fault = SetupFault(WRONG_SCALE, SetupPlace("car_a"), 0.5, 1e-4, 1.0, 0.1)
+    assert "taken for" not in setup_finding(system, fault).sentence
+    assert confusion(0.0254, "m") == "m taken for in" and confusion(1.0, "N") is None
