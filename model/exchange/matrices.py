@@ -242,7 +242,10 @@ def _sensor_of_output(path: Path, number: int, row: FloatArray, A: FloatArray, s
         return ("displacement", int(at[0]), -1) if at[0] < n else ("velocity", int(at[0] - n), -1)
     if len(at) == 2 and at.max() < n and sorted(row[at]) == [-1, 1]:
         return "deflection", int(at[row[at] == 1][0]), int(at[row[at] == -1][0])
-    raise ExchangeError(f"{path}: C: row {number + 1} is no displacement, velocity, acceleration or deflection")
+    raise ExchangeError(
+        f"{path}: C: row {number + 1} is no displacement, velocity, acceleration or deflection of single coordinates; "
+        "bodies that roll or pitch cannot be imported: describe them in a system file"
+    )
 
 
 def _check_feedthrough(

@@ -145,3 +145,11 @@ def test_what_is_no_network_is_refused_in_one_line(tmp_path: Path, change: dict[
     with pytest.raises(ExchangeError, match=said) as refused:
         read_matrices(written(tmp_path / "a.mat", **({"M": MASS, "C": C, "K": K, "S": ROWS} | change)))
     assert "\n" not in str(refused.value)
+
+
+def test_an_exported_vehicle_that_rolls_is_refused_with_the_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["system", "--export", str(tmp_path / "train.mat")]) == 0
+    assert main(["import", str(tmp_path / "train.mat"), "--rate", "100", "--out", str(tmp_path / "back.yaml")]) == 2
+    assert "bodies that roll or pitch cannot be imported" in capsys.readouterr().err
