@@ -61,6 +61,7 @@ class Recording:
         self.channels = tuple(channels)
         self.account = account
         self.seen = np.zeros(len(channels), dtype=bool)  # channels of which at least one valid value came
+        self.start_of_file = False  # the start is only when the file was written
         self._source = source
         self._start = start
         self._plausibility = PlausibilityCheck(channels, account, converter(channels))
@@ -117,7 +118,8 @@ class Recording:
         if self._start is None or not self.account.relative:
             return 0
         began = datetime.fromtimestamp(self._start / SECOND, UTC).strftime("%Y-%m-%d %H:%M:%S")
-        self.account.note(f"its times count from 0, which is taken to be {began} UTC")
+        of_file = ", the file's own time; give a start if it began at another" if self.start_of_file else ""
+        self.account.note(f"its times count from 0, which is taken to be {began} UTC{of_file}")
         return self._start - first
 
     def _nothing(self) -> str:

@@ -14,9 +14,10 @@ def open_stream(path: Path, system: System, dbc: Path | None = None, start: int 
 
     start: ns since 1970, when the recording began if its times count from 0; else the file's own time is taken.
     """
-    if start is None and path.is_file():
-        start = path.stat().st_mtime_ns
-    return open_recording(path, system.channels, dbc=dbc, time=system.time, start=start, beside=system.auxiliary)
+    written = path.stat().st_mtime_ns if start is None and path.is_file() else start
+    recording = open_recording(path, system.channels, dbc=dbc, time=system.time, start=written, beside=system.auxiliary)
+    recording.start_of_file = start is None
+    return recording
 
 
 def open_record(
