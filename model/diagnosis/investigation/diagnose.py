@@ -19,6 +19,7 @@ from sprung.model.diagnosis.investigation.judgement.judgement import (
 )
 from sprung.model.diagnosis.investigation.judgement.misfit_covariance import misfit_covariance
 from sprung.model.diagnosis.investigation.judgement.significance import (
+    exceeds_noise,
     shared_gain_covariance,
     without_insignificant,
     without_refuted,
@@ -138,25 +139,23 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     state = without_insignificant(state)
     progress(0.93, "the model on the whole recording")
     final = _on_whole_recording(state)
-    fewer = without_refuted(state, final)
-    if fewer is not None:
-        return concluded(fewer, progress)
     # what an unconverged fit still promised to fall bounds how far its values may yet move: by its last step s,
     # s_i^2 <= (s^T C^-1 s) C_ii (Cauchy and Schwarz), of the covariance C that noise alone gives
     moving = 0.0 if final.converged else final.left
     added = form_covariance(state) + shared_gain_covariance(state)
     final = replace(final, covariance=(1 + moving) * final.covariance + added)
+    fewer = without_refuted(state, final)
+    if fewer is not None:
+        return concluded(fewer, progress)
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
     judgement = judged(state, before, after, noisy, ended)
-    # the floor may contain what the findings leave; where chi-square shows it, values include it all the same
-    more = state.fit.reduced > noise_bound(state.problem, state.fit)
-    if more or np.any(judgement.errors.unexplained(state.options.rules.verdict) > 0):
+    if exceeds_noise(state) or np.any(judgement.errors.unexplained(state.options.rules.verdict) > 0):
         wider = misfit_covariance(state.problem, state.fit)
         final = replace(final, covariance=final.covariance + wider)
-        # masses and instruments that are off by less than what is told of them are not faults either
-        told = (1 + moving) * state.fit.covariance + added + wider
-        state = replace(state, fit=replace(state.fit, covariance=told))
+        # masses and instruments that are off by less than their stated deviations are no faults either
+        stated = (1 + moving) * state.fit.covariance + added + wider
+        state = replace(state, fit=replace(state.fit, covariance=stated))
         judgement = judged(state, before, after, noisy, ended)
     return Outcome(state, final, before, after, noisy, judgement)
 

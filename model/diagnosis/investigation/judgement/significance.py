@@ -23,6 +23,7 @@ from sprung.model.diagnosis.investigation.measurements.floor import leaves_more_
 from sprung.model.diagnosis.investigation.search.redundant import without
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
+from sprung.model.diagnosis.selection.compete import noise_bound
 from sprung.model.diagnosis.selection.plausible import hardly_there
 from sprung.model.signals import FloatArray
 
@@ -75,8 +76,15 @@ def shared_gain_covariance(state: Investigation) -> FloatArray:
 
 def _reported_covariance(state: Investigation) -> FloatArray:
     """The covariance that is reported."""
-    covariance = state.fit.covariance
-    return covariance + misfit_covariance(state.problem, state.fit) if leaves_more_than_noise(state) else covariance
+    fit = state.fit
+    if not exceeds_noise(state) and not leaves_more_than_noise(state):
+        return fit.covariance
+    return fit.covariance + misfit_covariance(state.problem, fit)
+
+
+def exceeds_noise(state: Investigation) -> bool:
+    """Whether chi-square says that more than noise is left: the floor of the held-out part may contain it."""
+    return state.fit.reduced > noise_bound(state.problem, state.fit)
 
 
 def _with_centred_gains(state: Investigation) -> Investigation:

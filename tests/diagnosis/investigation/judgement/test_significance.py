@@ -12,6 +12,7 @@ import pytest
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR
 from sprung.model.diagnosis.api import Options
 from sprung.model.diagnosis.fit import baseline
+from sprung.model.diagnosis.investigation import diagnose
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.judgement.significance import without_insignificant
 from sprung.model.diagnosis.investigation.measurements.calibration import centred, shared_gain, with_free_gains
@@ -38,6 +39,17 @@ def _heavier(ratio: float) -> Investigation:
 def test_a_finding_no_further_from_nothing_than_its_deviation_is_taken_out(ratio: float, kept: int) -> None:
     after = without_insignificant(_heavier(ratio))
     assert len(after.found) == len(after.fit.point.terms) == kept
+
+
+@pytest.mark.parametrize(("left", "kept"), [(0.0, 1), (1e6, 0)])
+def test_what_stated_deviations_do_not_distinguish_from_nothing_is_not_named(
+    monkeypatch: pytest.MonkeyPatch, left: float, kept: int
+) -> None:
+    """Deviations contain what a fit to the whole recording, where it has not converged, may yet move."""
+    whole = diagnose._on_whole_recording
+    monkeypatch.setattr(diagnose, "_on_whole_recording", lambda state: replace(whole(state), left=left))
+    outcome = diagnose.concluded(_heavier(1.2), lambda share, text: None)
+    assert len(outcome.investigation.found) == kept
 
 
 def test_a_fit_that_still_falls_is_fitted_on(monkeypatch: pytest.MonkeyPatch) -> None:
