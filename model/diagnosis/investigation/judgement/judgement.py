@@ -107,7 +107,8 @@ def _out_of_order(state: Investigation) -> int:
     """Number of masses and instruments that are off beyond their tolerances."""
     if state.calibrations:
         return len(faulty(state))
-    return sum(found.trial.term.law.error_of_value for found in state.found)
+    laws = [found.trial.term.law for found in state.found]
+    return sum(law.error_of_value or law.fault for law in laws)
 
 
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
@@ -115,7 +116,8 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
 
     More structural ones than a few in any case, more than one if they leave a significant error (`errors`): together
     linear parts approximate any linear structure, and true ones would leave noise.  Masses and instruments off beyond
-    their tolerances count, too, where they are most of all, are beside more than one structural change, or leave much.
+    their tolerances count, too, where they are most of all, are beside more than one structural change, or leave much:
+    they then take up what a law beside them lacks, which counts with them.
     """
     rules, parts = state.options.rules.verdict, changed_parts(state)
     if errors is None or parts > rules.parts:
@@ -126,7 +128,8 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
     if (state.calibrations and 2 * off > state.calibrations) or (parts > 1 and (left or off > 0)):
         return True
     much = left and share is not None and share < 1 - rules.parts_leave
-    return much and parts + off > rules.parts
+    beside = sum(found.trial.term.law.in_time for found in state.found) if off else 0
+    return much and parts + off + beside > rules.parts
 
 
 def _compared(state: Investigation, noise: Noise) -> tuple[tuple[Fit, Noise], ...]:

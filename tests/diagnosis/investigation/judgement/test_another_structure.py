@@ -37,6 +37,10 @@ def investigation(laws: list[str], moved: bool) -> Any:
         (["missing_connection", "coulomb_friction"], False, 0.20, False),
         (["missing_connection", "sensor_gain", "series_stiffness"], False, 0.02, True),  # what bending is imitated by
         (["missing_connection", "sensor_gain"], False, 0.02, False),
+        (["power_law_damping", "mass_change", "sensor_lag"], False, 0.20, True),  # what a second damper is imitated by
+        (["power_law_damping", "mass_change", "sensor_lag"], False, 0.02, False),
+        (["power_law_damping", "coulomb_friction", "bump_stop"], False, 0.20, False),
+        (["power_law_damping", "mass_change"], False, 0.20, False),
     ],
 )
 def test_changes_of_the_structure_are_named_when_they_are_few(
