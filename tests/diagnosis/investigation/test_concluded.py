@@ -56,7 +56,7 @@ def test_what_is_off_by_less_than_what_is_told_of_it_is_judged_by_what_is_told(
     state: Investigation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Masses and instruments are faults beyond their deviations: those that are reported, with what is unexplained."""
-    monkeypatch.setattr(diagnose, "noise_bound", lambda problem, fit: 0.0)
+    monkeypatch.setattr(diagnose, "exceeds_noise", lambda state: True)
     monkeypatch.setattr(diagnose, "misfit_covariance", lambda problem, fit: 9.0 * np.eye(len(fit.covariance)))
     outcome = concluded(state, lambda share, text: None)
     for told in (outcome.final, outcome.investigation.fit):
