@@ -25,7 +25,11 @@ class UploadRoom:
         return Share(self)
 
     def take(self, share: Share, count: int) -> None:
-        """Add bytes to a share.  Raises NoSpace when so many are not left."""
+        """Add bytes to a share.  Raises NoSpace when so many are not left.
+
+        A share that is refused is given back at once: of several uploads that come in pieces and do not all fit, as
+        many are received as do.
+        """
         with self._deciding:
             # the shares first: an upload that ends meanwhile counts twice instead of not at all
             with self._lock:
@@ -40,6 +44,7 @@ class UploadRoom:
                 free_bytes(settings.uploads) - settings.min_free_bytes - to_come,
             )
             if left <= 0 or left < count:
+                self.give_back(share)
                 raise NoSpace(
                     f"no room for this upload: {max(left, 0) / 1e6:.0f} MB are left for uploads; try again later"
                 )

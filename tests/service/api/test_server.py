@@ -282,6 +282,20 @@ def test_uploads_at_the_same_time_share_the_quota(client: TestClient, core: Core
     assert client.post(path, files={"file": ("last.mcap", b"z" * left)}).status_code == 202
 
 
+def test_an_upload_that_is_refused_leaves_its_room_to_the_others(core: Core, tmp_path: Path) -> None:
+    """Eight uploads that come in two pieces, of which four fit: all first pieces are there before any second one."""
+    room = UploadRoom(Settings(data_dir=tmp_path, max_uploads_bytes=50_000, min_free_bytes=0), core.store)
+    shares = [room.share() for _ in range(8)]
+    for share in shares:
+        share.take(6_000)
+    received = 0
+    for share in shares:
+        with suppress(NoSpace):
+            share.take(6_000)
+            received += 1
+    assert received == 4
+
+
 def test_uploads_at_the_same_time_leave_the_disk_its_free_bytes(
     core: Core, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
