@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from sprung.model.diagnosis.investigation.measurements.calibration import calibration_indices, faulty
-from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
+from sprung.model.diagnosis.investigation.measurements.data_sheets import within_data_sheet, within_tolerance
 from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import IdentifiedLaw
 from sprung.model.diagnosis.report.values import input_fault_parameter, law_parameters
@@ -36,15 +36,30 @@ def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     return tuple(IdentifiedLaw(term.location, term.law.name, (parameter,)) for _, term, parameter in significant)
 
 
-def in_words(calibration: Sequence[IdentifiedLaw], catalogue: Sequence[Law]) -> str:
-    """Summary; empty without calibration errors."""
+def beyond_tolerance(outcome: Outcome) -> frozenset[tuple[str, str]]:
+    """Place and effect of the errors above their tolerance, which their deviations do not distinguish from it."""
+    state = outcome.investigation
+    terms = [state.fit.point.terms[index] for index in calibration_indices(state)]
+    return frozenset((term.location, term.law.name) for term in terms if not within_data_sheet(state, term))
+
+
+def in_words(
+    calibration: Sequence[IdentifiedLaw], catalogue: Sequence[Law], beyond: Collection[tuple[str, str]] = ()
+) -> str:
+    """Summary; empty without calibration errors.  beyond: place and effect of those above their tolerance."""
     quantities = {law.name: f"{law.scales} " for law in catalogue if law.scales}
-    if not calibration:
-        return ""
+    within = [one for one in calibration if (one.location, one.effect) not in beyond]
+    uncertain = [one for one in calibration if (one.location, one.effect) in beyond]
+    parts = [f"within calibration: {_listed(within, quantities)}"] if within else []
+    if uncertain:
+        parts.append(f"too uncertain to be called a fault: {_listed(uncertain, quantities)}")
+    return "; ".join(parts)
+
+
+def _listed(calibration: Sequence[IdentifiedLaw], quantities: dict[str, str]) -> str:
     shown = [
         f"{one.location} {quantities.get(one.effect, '')}{parameter.name} {parameter.words()}"
         for one in calibration[:_SHOWN]
         for parameter in one.parameters
     ]
-    more = f" and {len(calibration) - _SHOWN} more" if len(calibration) > _SHOWN else ""
-    return f"within calibration: {', '.join(shown)}{more}"
+    return ", ".join(shown) + (f" and {len(calibration) - _SHOWN} more" if len(calibration) > _SHOWN else "")

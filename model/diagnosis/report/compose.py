@@ -10,7 +10,7 @@ from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
 from sprung.model.diagnosis.investigation.measurements.calibration import calibration_indices
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome, Recorded
 from sprung.model.diagnosis.report.advice import LOST_PHASE, nothing_fits, search_ended, undecided
-from sprung.model.diagnosis.report.calibration import calibration_of, in_words
+from sprung.model.diagnosis.report.calibration import beyond_tolerance, calibration_of, in_words
 from sprung.model.diagnosis.report.findings import findings_of
 from sprung.model.diagnosis.report.plot_data import plot_data_of
 from sprung.model.diagnosis.report.report import (
@@ -67,7 +67,9 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
         laws=_laws(outcome, calibration),
         calibration=calibration,
         noise=_noise(state),
-        summary=_summary(outcome, findings, explained, in_words(calibration, state.system.catalogue)),
+        summary=_summary(
+            outcome, findings, explained, in_words(calibration, state.system.catalogue, beyond_tolerance(outcome))
+        ),
         advice=tuple(advice),
         plot_data=plot_data_of(state, before, after, judgement.floor, [(f.location, f.effect) for f in findings]),
     )

@@ -88,3 +88,6 @@ def test_calibration_errors_are_said_with_what_they_scale_and_no_more_than_four(
     assert in_words((), CATALOGUE) == ""
     assert in_words((mass, gain), CATALOGUE).startswith("within calibration: car mass ratio 1.1")
     assert in_words((gain,) * 6, CATALOGUE).endswith(" and 2 more")
+    doubted = in_words((mass, gain), CATALOGUE, {("car", "mass_change")})
+    assert doubted.startswith("within calibration: ")
+    assert "; too uncertain to be called a fault: car mass ratio 1.1" in doubted
