@@ -98,6 +98,8 @@ class Conditions:
 
 
 FaultKind = Literal["gain", "delay", "frozen", "saturated", "inverted", "swapped", "silent", "noisy"]
+# of the whole channel at once, where gains and delays are off by an amount
+HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped", "silent", "noisy")
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,10 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sprung.model.signals import BoolArray, FloatArray
+from sprung.model.signals import HARD_FAULTS, BoolArray, FloatArray
 from sprung.model.tracking.drift import Drift
 from sprung.model.tracking.fusion import KNOWN
-from sprung.model.tracking.sensor_alarms import HARD_FAULTS
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Health, TrackerState
 

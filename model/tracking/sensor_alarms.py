@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.identification.measurements.deviations import Deviation, named
-from sprung.model.signals import FaultKind, FloatArray, MeasurementFault
+from sprung.model.signals import HARD_FAULTS, FaultKind, FloatArray, MeasurementFault
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking.deviation_model import DeviationModel
 from sprung.model.tracking.jumps import Jump
 from sprung.model.tracking.rules import AlarmRules
 from sprung.model.tracking.state import Alarm, Stuck, TrackerState
-
-HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped", "silent", "noisy")
 
 
 @dataclass(frozen=True, slots=True)

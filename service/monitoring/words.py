@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sprung.model.tracking.sensor_alarms import HARD_FAULTS
+from sprung.model.signals import HARD_FAULTS
 
 
 def spoken(parameter: str) -> str:

@@ -111,7 +111,7 @@ def test_a_second_ride_that_begins_at_0_is_tracked_on(tmp_path: Path, capfd: pyt
         assert lines[-1]["summary"]["windows"]["used"] > 35
         assert lines[-1]["summary"]["fitting"]["untracked"] == 0
     assert main(["replay", str(tmp_path / "ride.csv"), "--start", "noon", *options]) == 2
-    assert "a time such as" in capfd.readouterr().err
+    assert "a time with its zone is expected, such as 2026-09-21T14:13:20Z" in capfd.readouterr().err
     two = [str(tmp_path / "ride.csv")] * 2
     assert main(["replay", *two, "--start", "2026-09-23T08:00:00Z", *options]) == 2
     assert "give one FILE with it" in capfd.readouterr().err
