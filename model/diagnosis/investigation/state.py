@@ -115,6 +115,7 @@ class WidenedFit:
     fall: float  # of chi-square against the narrower one
     gain: float  # twice the log-likelihood ratio
     evidence: float  # gain less what the further parameters cost
+    instead: Trial | None = None  # the rival of the last finding whose law it is; None: the finding's own
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,19 @@ from sprung.model.diagnosis.fit.baseline import finished, refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, falling, try_optimise
 from sprung.model.diagnosis.investigation.search.minor import untried
 from sprung.model.diagnosis.investigation.state import Investigation, TriedWider, WidenedFit
+from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.along_measured import MeasuredMotion
-from sprung.model.diagnosis.selection.compete import Trial, by_evidence, compete, gain_over, noise_bound, shortlist
+from sprung.model.diagnosis.selection.compete import (
+    Trial,
+    by_evidence,
+    compete,
+    cost,
+    gain_over,
+    noise_bound,
+    shortlist,
+)
 from sprung.model.diagnosis.selection.evidence import occam_cost
 from sprung.model.diagnosis.selection.matched import matched_starts
 from sprung.model.diagnosis.selection.plausible import doubt
@@ -47,13 +56,13 @@ def _best_widened(state: Investigation) -> WidenedFit | None:
     """The wider form of highest evidence among the laws found so far; None: no law has one."""
     if state.problem.process_noise:
         return None
-    tried = [(index, _widened(state, index)) for index in range(state.given, len(state.fit.point.terms))]
-    fits = [(index, fit) for index, fit in tried if fit is not None]
+    tried = [(index, _widened(state, index), None) for index in range(state.given, len(state.fit.point.terms))]
+    fits = [(index, fit, rival) for index, fit, rival in (*tried, *_rivals_widened(state)) if fit is not None]
     rules = state.problem.rules.evidence
-    least = min((fit.reduced for _, fit in fits), default=1.0)
+    least = min((fit.reduced for _, fit, _ in fits), default=1.0)
     # if one leaves less than the noise level estimated with the narrow form, that smaller level counts
     quiet = rules.quiet * (least if least < rules.quiet else 1.0)
-    judged = [_judged(state, index, fit, quiet) for index, fit in fits]
+    judged = [_judged(state, index, fit, quiet, rival) for index, fit, rival in fits]
     return max(judged, key=lambda one: one.evidence, default=None)
 
 
@@ -83,7 +92,14 @@ def rivals_of_wider(state: Investigation, wide: WidenedFit) -> list[Candidate]:
 
 
 def adopt_wider(state: Investigation, wide: WidenedFit) -> Investigation:
-    """The investigation with a law that was found in its wider form."""
+    """The investigation with a law that was found, or a rival in its place, in its wider form."""
+    if wide.instead is not None:
+        *before, last = state.found
+        others = tuple(trial for trial in last.trials if trial is not wide.instead)
+        evidence, gain = last.trial.evidence + wide.evidence, last.trial.gain + wide.gain
+        trial = replace(wide.instead, evidence=evidence, gain=gain, reduction=last.trial.reduction + wide.fall)
+        swapped = replace(last, trial=trial, trials=(last.trial, *others), runner_up=last.trial)
+        state = replace(state, found=(*before, swapped))
     return with_model(state, wide.fit)
 
 
@@ -102,7 +118,7 @@ def form_covariance(state: Investigation) -> FloatArray:
     fit = state.fit
     nothing = np.zeros_like(fit.covariance)
     wide = best_wider(with_wider_tried(state)) if share_an_element(state) else None
-    if wide is None:
+    if wide is None or wide.instead is not None:
         return nothing
     rules = state.problem.rules.evidence
     evidence = wide.evidence + rules.rarity * wide.fit.point.terms[wide.index].law.prior_cost
@@ -145,15 +161,52 @@ def _widened(state: Investigation, index: int) -> Fit | None:
         measured = MeasuredMotion.of(problem, base)
         along = None if measured is None else measured.wider(index)
         starts += [along] if along is not None else []
-    tried = (try_optimise(problem, start, _FIRST, base.whitener) for start in starts)
+    return _from_best(state, starts)
+
+
+def _rivals_widened(state: Investigation) -> list[tuple[int, Fit | None, Trial | None]]:
+    """The model with the best rival of the last finding in its place, in its wider form.
+
+    Of two laws in their narrow forms the wrong one may be nearer to a third that only the other one can take: a power
+    of the rate is nearer to a friction that grows with the rate than a constant friction is.
+    """
+    if not state.found:
+        return []
+    last, index = state.found[-1].trial, len(state.fit.point.terms) - 1
+    rivals = [
+        trial
+        for trial in state.found[-1].trials
+        if trial.finished
+        and trial.term.location == last.term.location
+        and trial.term.law.name != last.term.law.name
+        and len(trial.fit.point.terms) == index + 1
+        and any(wider_starts(trial.fit, index))
+    ]
+    if not rivals:
+        return []
+    best = max(rivals, key=lambda trial: trial.evidence)
+    return [(index, _from_best(state, list(wider_starts(best.fit, index))), best)]
+
+
+def _from_best(state: Investigation, starts: list[Point]) -> Fit | None:
+    """The fit from the best of several starts; None where all diverge."""
+    problem, whitener = state.problem, state.fit.whitener
+    tried = (try_optimise(problem, start, _FIRST, whitener) for start in starts)
     best = min((fit for fit in tried if fit is not None), key=lambda fit: fit.chi_square, default=None)
     return None if best is None else falling(problem, best, _MORE, _ROUNDS)
 
 
-def _judged(state: Investigation, index: int, fit: Fit, quiet: float) -> WidenedFit:
+def _judged(state: Investigation, index: int, fit: Fit, quiet: float, rival: Trial | None) -> WidenedFit:
     """Evidence of the wider form over the present fit."""
     gain, fall = gain_over(state.problem, state.fit, fit, quiet)
-    return WidenedFit(fit, index, fall, gain, gain - _cost(state, fit, index))
+    more = _cost(state, fit, index) if rival is None else _cost_instead(state, fit, index)
+    return WidenedFit(fit, index, fall, gain, gain - more, rival)
+
+
+def _cost_instead(state: Investigation, fit: Fit, index: int) -> float:
+    """Cost in evidence of the parameters of a wider law over those of the law in whose place it is."""
+    rules = state.problem.rules.evidence
+    return cost(fit, rules, index) - cost(state.fit, rules, index)
 
 
 def _cost(state: Investigation, fit: Fit, index: int) -> float:

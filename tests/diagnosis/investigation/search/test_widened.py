@@ -44,7 +44,7 @@ def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together: bool) -> 
     for name, values in (("damper_blowoff", (KNEE, RATIO)), ("damper_asymmetry", (A,))):
         candidate: Any = SimpleNamespace(term=Term(find_law(name), "secondary", values, scales=tuple(map(abs, values))))
         fit = optimise(state.problem, start_of(fit, candidate), 6)
-    found: Any = tuple(SimpleNamespace(trial=SimpleNamespace(term=term)) for term in fit.point.terms)
+    found: Any = tuple(SimpleNamespace(trial=SimpleNamespace(term=term), trials=()) for term in fit.point.terms)
     state = replace(state, fit=fit, found=found)
     assert share_an_element(state)
     state = with_wider_tried(state)
@@ -60,13 +60,16 @@ def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together: bool) -> 
 
 def test_what_a_wider_form_says_otherwise_is_left_open_by_its_odds(monkeypatch: pytest.MonkeyPatch) -> None:
     fit: Any = SimpleNamespace(covariance=np.zeros((2, 2)), point=_point([0.1], (0.2,), 0.0))
-    wide: Any = SimpleNamespace(evidence=-12.0, index=0, fit=SimpleNamespace(point=_point([0.1], (0.3, 1.0), 12.0)))
+    other: Any = SimpleNamespace(point=_point([0.1], (0.3, 1.0), 12.0))
+    wide: Any = SimpleNamespace(evidence=-12.0, index=0, fit=other, instead=None)
     monkeypatch.setattr(widened, "share_an_element", lambda state: True)
     monkeypatch.setattr(widened, "with_wider_tried", lambda state: state)
     monkeypatch.setattr(widened, "best_wider", lambda state: wide)
     state: Any = SimpleNamespace(fit=fit, problem=SimpleNamespace(rules=RULES))
     np.testing.assert_allclose(form_covariance(state), [[0.0, 0.0], [0.0, 0.25 * 0.1**2]])
-    wide.evidence = -60.0
+    wide.instead = object()  # parameters of another law are no other values of these
+    assert np.all(form_covariance(state) == 0)
+    wide.instead, wide.evidence = None, -60.0
     assert np.all(form_covariance(state) < 1e-12)
 
 
