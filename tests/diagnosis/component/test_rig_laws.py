@@ -17,7 +17,7 @@ from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.search import search
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.laws import SpringDamper
-from sprung.model.system import parse_system
+from sprung.model.system import System, parse_system
 from tests.diagnosis.component.test_component import RATE, C, K, RigRecording, sweep
 
 T, D, V = sweep(20.0)
@@ -43,6 +43,20 @@ elements:
 sensors: {{cell: {{kind: force, element: damper, csv: F, noise: {noise}}}}}
 {more}""")
     return diagnose(system, RigRecording(np.column_stack(columns)))
+
+
+def bench(rate: float, window: int, stiffness: float, damping: float, noise: str = ", noise: 1.0") -> System:
+    """A specimen between a measured displacement and a load cell; noise: what the file says of the cell's."""
+    return parse_system(f"""
+name: damper on a test bench
+sample_rate: {rate}
+window: {window}
+bodies: {{}}
+inputs: {{rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}}}
+elements:
+  damper: {{upper: rod, lower: ground, stiffness: {stiffness}, damping: {damping}}}
+sensors: {{cell: {{kind: force, element: damper, csv: F{noise}}}}}
+""")
 
 
 def presliding(force: float, stiffness: float, static: float, fall: float) -> np.ndarray:
@@ -208,16 +222,7 @@ def test_the_inertia_of_a_fixture_is_named_with_its_mass() -> None:
     a = 1.5e-3 * (-(turning**2) * np.sin(phase) + 2 * np.pi * (40.0 - 0.5) / seconds * np.cos(phase))
     random = np.random.default_rng(5)
     force = 8e5 * d + 900.0 * v + 6.0 * a + 500.0 + random.standard_normal(len(t))
-    system = parse_system(f"""
-name: mount on a test bench
-sample_rate: {rate}
-window: 400
-bodies: {{}}
-inputs: {{rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}}}
-elements:
-  mount: {{upper: rod, lower: ground, stiffness: 6e5, damping: 700.0}}
-sensors: {{cell: {{kind: force, element: mount, csv: F, noise: 1.0}}}}
-""")
+    system = bench(rate, 400, 6e5, 700.0)
     values = np.column_stack([d + 4e-7 * random.standard_normal(len(t)), force])
     report = diagnose(system, RigRecording(values, rate))
     assert report.verdict == "missing_physics"
@@ -243,16 +248,7 @@ def test_a_force_at_the_highest_frequencies_that_follows_the_motion_is_no_noise(
     t, d, v, a = shaken(40.0, rate, 20)
     random = np.random.default_rng(21)
     force = 5e4 * d + 1200.0 * v + 1.0 * a + noise * random.standard_normal(len(t))
-    system = parse_system(f"""
-name: damper on a test bench
-sample_rate: {rate}
-window: 250
-bodies: {{}}
-inputs: {{rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}}}
-elements:
-  damper: {{upper: rod, lower: ground, stiffness: 3.5e4, damping: 900.0}}
-sensors: {{cell: {{kind: force, element: damper, csv: F, noise: {noise}}}}}
-""")
+    system = bench(rate, 250, 3.5e4, 900.0)
     values = np.column_stack([d + 1e-6 * random.standard_normal(len(t)), force])
     (record,) = component_records(system, values, rate)
     assert record.task.noise == pytest.approx(noise, rel=0.5)
@@ -265,16 +261,7 @@ def test_friction_that_turns_as_fast_as_noise_is_no_noise_beyond_what_a_declarat
     force = 4e4 * d + 600.0 * np.sign(v) + np.random.default_rng(5).standard_normal(len(d))
 
     def seen(declared: str) -> float:
-        system = parse_system(f"""
-name: damper on a test bench
-sample_rate: {rate}
-window: 64
-bodies: {{}}
-inputs: {{rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}}}
-elements:
-  damper: {{upper: rod, lower: ground, stiffness: 4e4, damping: 1.5e3}}
-sensors: {{cell: {{kind: force, element: damper, csv: F{declared}}}}}
-""")
+        system = bench(rate, 64, 4e4, 1.5e3, declared)
         (record,) = component_records(system, np.column_stack([d, force]), rate)
         return record.task.noise
 
