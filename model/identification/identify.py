@@ -18,6 +18,7 @@ from sprung.model.identification.estimates import EXCITED, estimates, not_identi
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.fault_isolation.explainer import Explainer
 from sprung.model.identification.fault_isolation.explanation import FaultExplanation, fits, unexplained
+from sprung.model.identification.fault_isolation.restoring import Restorer
 from sprung.model.identification.likelihood.linearise import PRIOR_STD, prior_std
 from sprung.model.identification.measurements.deviations import deviations
 from sprung.model.identification.model_uncertainty import ModelUncertainty, model_uncertainty
@@ -307,7 +308,7 @@ class Identifier:
             estimator = self.estimator
             fitting = estimator is not None and estimator.samples == samples
             start = partial(self._begin, workers=1, loads=bool(self.system.loads)) if fitting else _nothing
-            self._explainers[samples] = Explainer(self.system, samples, self._refiner, start)
+            self._explainers[samples] = Explainer(Restorer(self.system, samples, self._refiner, start))
         return self._explainers[samples]
 
     def _refiner(self, samples: int) -> RefinerOfAnyInputs:

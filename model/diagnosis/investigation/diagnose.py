@@ -49,7 +49,6 @@ from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
 from sprung.model.diagnosis.rules import Rules
-from sprung.model.diagnosis.selection.compete import noise_bound
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import out_of_range
 from sprung.model.system import System
@@ -89,7 +88,7 @@ def _with_several(state: Investigation, progress: Progress) -> Investigation | N
     if several is None:
         return None
     several = _one_by_one(several, progress)
-    if leaves_more_than_noise(several) or several.fit.reduced > noise_bound(several.problem, several.fit):
+    if leaves_more_than_noise(several) or exceeds_noise(several):
         return None
     return replace(several, problem=replace(several.problem, work=work))
 

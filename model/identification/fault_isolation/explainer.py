@@ -11,7 +11,7 @@ springs as any other.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,9 +23,7 @@ from sprung.model.identification.fault_isolation.restoring import Faults, Restor
 from sprung.model.identification.fault_isolation.steps import EVIDENT
 from sprung.model.identification.fault_isolation.stuck import STUCK, StuckChannels
 from sprung.model.identification.measurements.deviations import clock_groups
-from sprung.model.identification.refinement.any_inputs import RefinerOfAnyInputs
 from sprung.model.signals import FloatArray, IntArray, MeasurementFault
-from sprung.model.system import System
 
 TRIED = 8  # windows of a batch; when none of them can be explained, the others are not tried
 _FAR_TRIED = 2  # windows of a batch that very late clocks are tried on, as many as may have something in common
@@ -37,20 +35,13 @@ _SLIGHT = 0.1  # of what a data sheet leaves open; less is not taken back
 class Explainer:
     """Searches for what is wrong with the measurements of windows of one system and length."""
 
-    def __init__(
-        self,
-        system: System,
-        samples: int,
-        refiner: Callable[[int], RefinerOfAnyInputs],
-        start: Callable[[FloatArray], FloatArray | None],
-    ) -> None:
-        """refiner: of windows of so many samples; start: from windows (B, T, C) to log-ratios to refine from."""
-        self.restorer = Restorer(system, samples, refiner, start)
+    def __init__(self, restorer: Restorer) -> None:
+        self.restorer, system = restorer, restorer.system
         self.corrections, self.steps = self.restorer.corrections, self.restorer.steps
         self.channels, self.names = len(system.channels), self.restorer.names
         units = [channel.unit for channel in system.channels]
         alike = [(int(group), unit) for group, unit in zip(clock_groups(system), units, strict=True)]
-        self.contradictions = Contradictions(refiner(samples).calibration, _numbers(units))
+        self.contradictions = Contradictions(restorer.refiner(restorer.samples).calibration, _numbers(units))
         # Tried where nothing contradicts: of one clock, and of inputs, whose supports may be measured but once
         of_one_clock = set(rearrangements(_numbers(alike)))
         tried = [r for r in rearrangements(_numbers(units)) if r in of_one_clock or max(r.columns) < len(system.inputs)]
