@@ -107,7 +107,7 @@ class Tokens:
         text = f"{PREFIX}_{token_id}_{secret}"
         now = self._clock()
         expires = None if days is None else now + round(days * DAY)
-        return text, TokenRow(token_id, digest_of(text), name, list(scopes), fleet, now, expires, None, None)
+        return text, TokenRow(token_id, digest_of(text), name, list(scopes), fleet, now, expires, None)
 
     def _add(self, connection: Connection, row: TokenRow, action: str, more: dict[str, str], by: str) -> None:
         tokens.add(connection, row)

@@ -245,7 +245,6 @@ tokens = Table(  # who may ask; the secret itself is kept nowhere
     Column("created_ns", BigInteger, nullable=False),
     Column("expires_ns", BigInteger, nullable=True),
     Column("revoked_ns", BigInteger, nullable=True),
-    Column("used_ns", BigInteger, nullable=True),
 )
 
 audit = Table(  # who did what, and when

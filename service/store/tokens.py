@@ -21,7 +21,6 @@ class TokenRow:
     created_ns: int
     expires_ns: int | None
     revoked_ns: int | None
-    used_ns: int | None
 
 
 def add(connection: Connection, row: TokenRow) -> None:
