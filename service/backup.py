@@ -3,6 +3,9 @@
 The file is a tar: the store as SQLite's own online back-up gives it (a consistent snapshot), uploads and reports, and a
 manifest.  The store comes first, so every file that it speaks of is there, unless retention forgot it meanwhile.
 A back-up that was cut short is no back-up: its manifest, written last, is missing.
+
+Nobody can say which tokens were revoked after a back-up was made, so none of those in it is good after its restoration,
+unless whoever restores it says so.
 """
 
 from __future__ import annotations
@@ -21,10 +24,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from sprung import __version__
+from sprung.service.access.tokens import Tokens
 from sprung.service.durable import sync_file, sync_folder, sync_tree
 from sprung.service.errors import UserError
 from sprung.service.lock import held
 from sprung.service.settings import Settings
+from sprung.service.store import audit, open_store
+from sprung.service.store.tokens import TokenRow
 from sprung.service.times import now_ns, to_iso
 
 MANIFEST = "manifest.json"
@@ -42,6 +48,14 @@ class Backup:
     version: str
     files: dict[str, str]  # name: SHA-256
     bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """What came back."""
+
+    backup: Backup
+    tokens: list[TokenRow]  # that were not revoked when it was made, the newest first
 
 
 def back_up(settings: Settings, target: Path) -> Backup:
@@ -77,9 +91,10 @@ def back_up(settings: Settings, target: Path) -> Backup:
     return Backup(str(manifest["created"]), __version__, digests, size)
 
 
-def restore(settings: Settings, source: Path) -> Backup:
+def restore(settings: Settings, source: Path, keep_tokens: bool = False) -> Restored:
     """Put a back-up into a data folder that has no store; every file is checked before anything is in its place.
 
+    keep_tokens: leave those good that were so when the back-up was made, also if they were revoked since.
     Raises UserError for an incomplete back-up, and for a folder that is in use or holds a store.
     """
     target = _store_file(settings)
@@ -92,6 +107,7 @@ def restore(settings: Settings, source: Path) -> Backup:
         try:
             found = _extract(source, part)
             _check_store(part / STORE)
+            tokens = _tokens(part / STORE, found, keep_tokens)
             sync_tree(part)
             for name in FOLDERS:
                 _merge(part / name, settings.data_dir / name)
@@ -103,7 +119,29 @@ def restore(settings: Settings, source: Path) -> Backup:
             sync_folder(settings.data_dir)
         finally:
             shutil.rmtree(part, ignore_errors=True)
-    return found
+    return Restored(found, tokens)
+
+
+def _tokens(path: Path, found: Backup, keep: bool) -> list[TokenRow]:
+    """Those of a restored store that were not revoked, which they are now unless they are kept."""
+    store = open_store(f"sqlite:///{path}")
+    try:
+        every = Tokens(store)
+        kept = [row for row in every.rows() if row.revoked_ns is None]
+        gone = [] if keep else every.revoke_all("restoration")
+        with store.write() as connection:
+            detail = {"of": found.created, "tokens": "kept" if keep else "revoked"}
+            audit.record(connection, "local", "restore", STORE, detail, now_ns())
+    finally:
+        store.close()
+    _one_file(path)
+    return kept if keep else gone
+
+
+def _one_file(path: Path) -> None:
+    """Leave no log beside a store that nobody else has open."""
+    with closing(sqlite3.connect(path)) as store:
+        store.execute("PRAGMA journal_mode = DELETE")
 
 
 def _store_file(settings: Settings) -> Path:
@@ -119,7 +157,7 @@ def _snapshot(source: Path, copy: Path) -> None:
     try:
         with closing(sqlite3.connect(source, timeout=60)) as store, closing(sqlite3.connect(copy)) as target:
             store.backup(target, pages=1000)
-            target.execute("PRAGMA journal_mode = DELETE")  # one file, without a log beside it
+        _one_file(copy)
     except sqlite3.Error as error:
         raise UserError(f"{source}: cannot be backed up ({error})") from error
     _check_store(copy)

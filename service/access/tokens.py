@@ -144,6 +144,16 @@ class Tokens:
             audit.record(connection, by, "revoke token", token_id, None, now)
         self._forget()
 
+    def revoke_all(self, by: str = "local") -> list[TokenRow]:
+        """Make every token worthless; those that were not revoked before, the newest first."""
+        now = self._clock()
+        with self._store.write() as connection:
+            revoked = [row for row in tokens.list_all(connection) if tokens.revoke(connection, row.id, now)]
+            for row in revoked:
+                audit.record(connection, by, "revoke token", row.id, None, now)
+        self._forget()
+        return revoked
+
     def rows(self) -> list[TokenRow]:
         """Every token, the newest first."""
         with self._store.read() as connection:

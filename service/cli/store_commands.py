@@ -44,13 +44,19 @@ def backup(
 
 def restore(
     source: Annotated[Path, typer.Argument(help="Back-up that `sprung backup` wrote.", metavar="FILE")],
+    keep_tokens: Annotated[
+        bool, typer.Option("--keep-tokens", help="Leave its access tokens good, also those that were revoked since.")
+    ] = False,
     data_dir: DataDir = None,
     store: StoreUrl = None,
 ) -> int:
-    """Put a back-up into a data folder that has no store yet."""
+    """Put a back-up into a data folder that has no store yet.
+
+    Its access tokens are revoked, since nothing in it says which of them were revoked later.
+    """
     from sprung.service.cli.backup import restore as run
 
-    return run(source, data_dir, store)
+    return run(source, keep_tokens, data_dir, store)
 
 
 @token.command("create")
@@ -93,11 +99,12 @@ def token_rotate(
 
 @token.command("revoke")
 def token_revoke(
-    token_id: Annotated[str, typer.Argument(help="As `sprung token list` shows it.", metavar="ID")],
+    token_id: Annotated[str | None, typer.Argument(help="As `sprung token list` shows it.", metavar="ID")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Every token, as after a database was restored.")] = False,
     data_dir: DataDir = None,
     store: StoreUrl = None,
 ) -> int:
-    """Make a token worthless."""
+    """Make a token worthless, or all of them."""
     from sprung.service.cli.token import revoke
 
-    return revoke(token_id, data_dir, store)
+    return revoke(token_id, every, data_dir, store)

@@ -50,9 +50,15 @@ def rotate(token_id: str, hours: float, data_dir: Path | None, store: str | None
     return 0
 
 
-def revoke(token_id: str, data_dir: Path | None, store: str | None) -> int:
-    """Make a token worthless."""
+def revoke(token_id: str | None, every: bool, data_dir: Path | None, store: str | None) -> int:
+    """Make a token worthless, or all of them, which are then printed."""
+    if every == (token_id is not None):
+        raise UserError("give the ID of a token, as sprung token list shows it, or --all")
     with opened(data_dir, store) as tokens:
+        if token_id is None:
+            for row in tokens.revoke_all():
+                print(f"{row.id}  {row.name}")
+            return 0
         try:
             tokens.revoke(token_id)
         except LookupError as error:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from sprung.model.system import System
+from sprung.service.access.tokens import Refused, Tokens
 from sprung.service.backup import back_up, restore
 from sprung.service.cli import main
 from sprung.service.errors import UserError
@@ -57,6 +58,45 @@ def test_what_was_backed_up_comes_back(lived_in: Settings, tmp_path: Path, capsy
     found = sorted(str(p.relative_to(new.data_dir)) for p in new.data_dir.rglob("*") if p.is_file())
     assert found == ["reports/r1/report.html", "sprung.db", "sprung.lock", "uploads/a.csv"]
     open_store(new.store_url).close()  # and the service can go on with it
+
+
+def good_tokens(settings: Settings, *secrets: str) -> list[bool]:
+    store = open_store(settings.store_url)
+    try:
+        return [_is_good(Tokens(store), secret) for secret in secrets]
+    finally:
+        store.close()
+
+
+def _is_good(tokens: Tokens, secret: str) -> bool:
+    try:
+        tokens.actor(secret)
+    except Refused:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_token_that_was_revoked_since_does_not_come_back_unnoticed(
+    lived_in: Settings, tmp_path: Path, capsys: pytest.CaptureFixture[str], keep: bool
+) -> None:
+    store = open_store(lived_in.store_url)
+    tokens = Tokens(store)
+    (stolen, row), (gone, before) = tokens.create("stolen laptop", ["admin"]), tokens.create("long gone", ["read"])
+    tokens.revoke(before.id)
+    back_up(lived_in, tmp_path / "b.tar")
+    tokens.revoke(row.id)
+    store.close()
+    new = Settings(data_dir=tmp_path / "new")
+    options = ["--keep-tokens"] if keep else []
+    assert main(["restore", str(tmp_path / "b.tar"), "--data-dir", str(new.data_dir), *options]) == 0
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and f"{row.id} (stolen laptop)" in told and before.id not in told
+    assert ("are good again" if keep else "are revoked") in told
+    assert good_tokens(new, stolen, gone) == [keep, False]
+    with closing(sqlite3.connect(new.data_dir / "sprung.db")) as restored:
+        noted = restored.execute("SELECT action, target FROM audit ORDER BY id").fetchall()
+    assert noted[-1] == ("restore", "sprung.db") and (("revoke token", row.id) in noted) is not keep
 
 
 def test_a_folder_in_use_is_not_restored_into(lived_in: Settings, tmp_path: Path) -> None:

@@ -250,6 +250,21 @@ def test_a_token_is_rotated_and_the_old_one_ends(store: Store) -> None:
     assert found.actor(new).name == "feeder"
 
 
+def test_every_token_can_be_revoked_at_once(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    """After a database was restored by its own tools: nothing in it says which tokens were revoked later."""
+    tokens = Tokens(store)
+    (text, row), (_, before) = tokens.create("edge", ["ingest"]), tokens.create("old", ["read"])
+    tokens.revoke(before.id)
+    url = str(store.engine.url)
+    assert main(["token", "revoke", "--all", "--store", url]) == 0
+    assert capsys.readouterr().out == f"{row.id}  edge\n"
+    with pytest.raises(Refused):
+        Tokens(store).actor(text)
+    for wrong in ([], [row.id, "--all"]):
+        assert main(["token", "revoke", *wrong, "--store", url]) == 2
+        assert "or --all" in capsys.readouterr().err
+
+
 def test_a_token_that_is_rotated_ends_no_later_than_it_would_have(store: Store) -> None:
     now = time.time_ns()
     found = Tokens(store, clock=lambda: now)
