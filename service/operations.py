@@ -1,9 +1,13 @@
-"""What people do to vehicles and alarms: each deed in one transaction, with its line in the audit log."""
+"""What people do to vehicles and alarms: each deed in one transaction, with its line in the audit log.
+
+`noted` writes more down in that transaction: the answer that a repeated request gets.
+"""
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from sqlalchemy import Connection
 
@@ -21,6 +25,12 @@ from sprung.service.store.windows import latest_window
 from sprung.service.times import now_ns
 
 MOST_ALARMS = 10_000
+T = TypeVar("T")
+Noted = Callable[[Connection, T], None]  # called inside the transaction of a deed with what came of it
+
+
+def _unnoted(connection: Connection, found: object) -> None:
+    """Nobody else writes a deed down."""
 
 
 class Operations:
@@ -36,7 +46,7 @@ class Operations:
         self._forget = forget
         self._archive = archive
 
-    def acknowledge(self, actor: str, vehicle: str, alarm: int | None = None) -> int:
+    def acknowledge(self, actor: str, vehicle: str, alarm: int | None = None, noted: Noted[int] = _unnoted) -> int:
         """Write down that somebody has seen a vehicle's alarm, or all that are active; how many.  Raises NotFound."""
         now = now_ns()
         with self._store.write() as connection:
@@ -51,9 +61,10 @@ class Operations:
             status.refresh_urgency(connection, vehicle)
             detail = {"alarms": [row.id for row in found][:100]}
             audit.record(connection, actor, "acknowledge", vehicle, detail, now)
+            noted(connection, len(found))
         return len(found)
 
-    def note(self, actor: str, vehicle: str, text: str, time: int | None) -> MarkRow:
+    def note(self, actor: str, vehicle: str, text: str, time: int | None, noted: Noted[MarkRow] = _unnoted) -> MarkRow:
         """Write a note on the time line.  Raises NotFound."""
         now = now_ns()
         with self._store.write() as connection:
@@ -61,10 +72,17 @@ class Operations:
             row = MarkRow(0, vehicle, "note", now if time is None else time, text, None, actor, now)
             kept = marks.add_mark(connection, row)
             audit.record(connection, actor, "note", vehicle, {"mark": kept.id}, now)
+            noted(connection, kept)
         return kept
 
     def maintenance(
-        self, actor: str, vehicle: str, text: str, time: int | None, parameters: Sequence[str] | None
+        self,
+        actor: str,
+        vehicle: str,
+        text: str,
+        time: int | None,
+        parameters: Sequence[str] | None,
+        noted: Noted[MarkRow] = _unnoted,
     ) -> MarkRow:
         """Mark a maintenance and forget the baselines of `parameters` (None: of all; empty: of none).
 
@@ -84,11 +102,12 @@ class Operations:
             row = MarkRow(0, vehicle, "maintenance", now if time is None else time, text, learned, actor, now)
             kept = marks.add_mark(connection, row)
             audit.record(connection, actor, "maintenance", vehicle, {"mark": kept.id, "parameters": learned}, now)
+            noted(connection, kept)
         if batch is not None:
             self._pipeline.publish(batch)
         return kept
 
-    def give_model(self, actor: str, vehicle: str, text: str, report: str | None) -> int:
+    def give_model(self, actor: str, vehicle: str, text: str, report: str | None, noted: Noted[int] = _unnoted) -> int:
         """Keep a system file as the vehicle's next version and follow it with that from now on; the version.
 
         One that the vehicle has had before is used again as the version that it was.
@@ -104,15 +123,17 @@ class Operations:
             model = fleet.ensure_model(connection, engine.digest, engine.system.name, engine.description(), now)
             version = vehicle_models.version_of(connection, vehicle, text)
             if version is not None and version == vehicle_models.current_version(connection, vehicle):
+                noted(connection, version)
                 return version
             if version is None:
                 version = vehicle_models.add_version(connection, vehicle, model, text, report, actor, now)
             engines.remember(vehicle, ServedModel(version, engine, model))
             batch = self._switch(connection, actor, vehicle, version, report, now)
+            noted(connection, version)
         self._pipeline.publish(batch)
         return version
 
-    def use_model(self, actor: str, vehicle: str, version: int) -> None:
+    def use_model(self, actor: str, vehicle: str, version: int, noted: Noted[int] = _unnoted) -> None:
         """Follow a vehicle with an earlier version again, or with the service's own file (0).
 
         Raises NotFound where there is no such version, UserError where it does not belong to this service any more.
@@ -124,9 +145,11 @@ class Operations:
             if version != SERVICE_FILE and vehicle_models.get_version(connection, vehicle, version) is None:
                 raise NotFound(f"vehicle {vehicle} has no model {version}")
             if version == vehicle_models.current_version(connection, vehicle):
+                noted(connection, version)
                 return
             self._pipeline.engines.version(connection, vehicle, version)
             batch = self._switch(connection, actor, vehicle, version, None, now)
+            noted(connection, version)
         self._pipeline.publish(batch)
 
     def _switch(

@@ -12,9 +12,7 @@ from sqlalchemy import Connection
 from sprung.service.access.tokens import Actor
 from sprung.service.api.problems import ApiProblem
 from sprung.service.core import Core
-from sprung.service.jobs.queue import Noted
 from sprung.service.store import audit
-from sprung.service.store.work import JobRow
 from sprung.service.times import now_ns
 
 T = TypeVar("T")
@@ -47,15 +45,6 @@ async def note(core: Core, actor: Actor, action: str, target: str, detail: dict[
             audit.record(connection, actor.name, action, target, detail, now_ns())
 
     await run_in_threadpool(work)
-
-
-def noting(actor: Actor, action: str, detail: dict[str, str | None] | None = None) -> Noted:
-    """Writes who asked for a job into the audit log, in the transaction that stores the job."""
-
-    def work(connection: Connection, job: JobRow) -> None:
-        audit.record(connection, actor.name, action, job.id, detail or {"vehicle": job.vehicle_id}, now_ns())
-
-    return work
 
 
 def known_vehicle(found: bool, vehicle: str) -> None:

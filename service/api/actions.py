@@ -8,6 +8,7 @@ from fastapi import APIRouter, Query
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from pydantic import Field
+from sqlalchemy import Connection
 
 from sprung.model.tracking.tracker import TrackerStateError
 from sprung.service.api import models
@@ -16,7 +17,7 @@ from sprung.service.api.actors import ActorOf
 from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import LINE_PATTERN, TEXT_PATTERN, StrictBody
 from sprung.service.api.fleet import vehicle_answer
-from sprung.service.api.idempotency import IdempotentRequests, OnceOf
+from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.problems import ApiProblem
 from sprung.service.api.queries import Id, Limit
 from sprung.service.store import fleet, marks
@@ -71,18 +72,20 @@ class VehicleBody(StrictBody):
 async def acknowledge(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: AcknowledgeBody) -> Response:
     """Somebody has seen them; they stay active until the vehicle is well again."""
 
-    async def act() -> Response:
-        await run_in_threadpool(core.operations.acknowledge, actor.name, id_, body.alarm)
-        return json_response(await read(core, lambda connection: vehicle_answer(core, connection, id_)))
+    def respond(connection: Connection, _: int) -> Response:
+        return json_response(vehicle_answer(core, connection, id_))
 
-    return await _once(once, act)
+    async def act() -> None:
+        await run_in_threadpool(core.operations.acknowledge, actor.name, id_, body.alarm, once.keeping(respond))
+
+    return await once.answer(act)
 
 
 @router.get("/vehicles/{id}/marks", summary="Notes and maintenance", response_model=models.Marks)
 async def list_marks(core: CoreOf, id_: Id, limit: Limit = 100) -> Response:
     """Marks on the vehicle's time line, newest first."""
 
-    def query(connection: Any) -> list[MarkRow]:
+    def query(connection: Connection) -> list[MarkRow]:
         known_vehicle(fleet.vehicle_exists(connection, id_), id_)
         return marks.list_marks(connection, id_, limit)
 
@@ -93,11 +96,11 @@ async def list_marks(core: CoreOf, id_: Id, limit: Limit = 100) -> Response:
 async def note(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: NoteBody) -> Response:
     """A line on the vehicle's time line."""
 
-    async def act() -> Response:
-        kept = await run_in_threadpool(core.operations.note, actor.name, id_, body.text, _time(body.time))
-        return json_response(mark_dict(kept), 201)
+    async def act() -> None:
+        keep = once.keeping(_mark_answer)
+        await run_in_threadpool(core.operations.note, actor.name, id_, body.text, _time(body.time), keep)
 
-    return await _once(once, act)
+    return await once.answer(act)
 
 
 @router.post(
@@ -106,17 +109,16 @@ async def note(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: NoteBo
 async def maintenance(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: MaintenanceBody) -> Response:
     """Closes the alarms of the parameters that were worked on and learns their baselines anew."""
 
-    async def act() -> Response:
-        time = _time(body.time)
+    async def act() -> None:
+        time, keep = _time(body.time), once.keeping(_mark_answer)
         try:
-            kept = await run_in_threadpool(
-                core.operations.maintenance, actor.name, id_, body.text, time, body.parameters
+            await run_in_threadpool(
+                core.operations.maintenance, actor.name, id_, body.text, time, body.parameters, keep
             )
         except TrackerStateError as error:
             raise ApiProblem(422, str(error), [{"field": "parameters", "detail": str(error)}]) from error
-        return json_response(mark_dict(kept), 201)
 
-    return await _once(once, act)
+    return await once.answer(act)
 
 
 @router.patch("/vehicles/{id}", summary="Rename or retire a vehicle", response_model=models.VehicleAnswer)
@@ -157,9 +159,8 @@ def mark_dict(row: MarkRow) -> dict[str, Any]:
     }
 
 
-async def _once(once: IdempotentRequests, act: Any) -> Response:
-    answer: Response = await once.answer(act)
-    return answer
+def _mark_answer(_: Connection, row: MarkRow) -> Response:
+    return json_response(mark_dict(row), 201)
 
 
 def _time(text: str | None) -> int | None:

@@ -12,13 +12,13 @@ from sqlalchemy import Connection
 
 from sprung.service.access.tokens import Actor
 from sprung.service.api import job_models
-from sprung.service.api.access import CoreOf, known_vehicle, noting, read
+from sprung.service.api.access import CoreOf, known_vehicle, read
 from sprung.service.api.actors import ActorOf, own_vehicle
 from sprung.service.api.answers import json_response
 from sprung.service.api.bodies import DiagnoseBody
 from sprung.service.api.idempotency import IdempotentRequests, OnceOf
 from sprung.service.api.problems import ApiProblem, from_validation
-from sprung.service.api.recordings import job_dict
+from sprung.service.api.recordings import noting
 from sprung.service.api.scopes import FORM, content_kind
 from sprung.service.api.uploads import BODY as UPLOAD
 from sprung.service.api.uploads import receive
@@ -28,7 +28,7 @@ from sprung.service.errors import NotFound
 from sprung.service.notify.events import vehicle_page
 from sprung.service.report.links import with_links
 from sprung.service.store import fleet, work
-from sprung.service.store.work import JobRow, RecordingRow, ReportRow
+from sprung.service.store.work import RecordingRow, ReportRow
 
 router = APIRouter(tags=["diagnosis"])
 MOST_REFERENCE_BYTES = 4096
@@ -53,16 +53,15 @@ async def diagnose(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf)
     before (`{"recording": id}`), or of the last minute of a vehicle (`{"vehicle": id}`).  The job's result names
     the report."""
 
-    async def act() -> Response:
+    async def act() -> None:
         core.jobs.reserve()
         kind = content_kind(request.headers)
         if kind == FORM:
-            job = await _of_upload(request, core, actor, once)
+            await _of_upload(request, core, actor, once)
         elif kind == "application/json":
-            job = await _of_reference(request, core, actor)
+            await _of_reference(request, core, actor, once)
         else:
             raise ApiProblem(415, "send multipart/form-data with a file, or application/json")
-        return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
 
     return await once.answer(act)
 
@@ -107,15 +106,15 @@ async def report_system(core: CoreOf, actor: ActorOf, id: str) -> Response:
     return Response(text, media_type="application/yaml", headers=named)
 
 
-async def _of_upload(request: Request, core: Core, actor: Actor, once: IdempotentRequests) -> JobRow:
+async def _of_upload(request: Request, core: Core, actor: Actor, once: IdempotentRequests) -> None:
     async with receive(request, core) as found:
         once.received(found.identity)
         own_vehicle(actor, found.vehicle)
-        noted = noting(actor, "diagnose")
-        return await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle, noted)
+        noted = noting(actor, "diagnose", once)
+        await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle, noted)
 
 
-async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
+async def _of_reference(request: Request, core: Core, actor: Actor, once: IdempotentRequests) -> None:
     raw = await request.body()
     if len(raw) > MOST_REFERENCE_BYTES:
         raise ApiProblem(413, f"what names a recording or a vehicle has at most {MOST_REFERENCE_BYTES} bytes")
@@ -126,11 +125,13 @@ async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
     if (body.recording is None) == (body.vehicle is None):
         detail = "give either recording or vehicle"
         raise ApiProblem(422, detail, [{"field": "recording", "detail": detail}])
+    noted = noting(actor, "diagnose", once)
     if body.recording is None:
         vehicle = str(body.vehicle)
         own_vehicle(actor, vehicle)
         known_vehicle(await read(core, lambda c: fleet.vehicle_exists(c, vehicle)), vehicle)
-        return await run_in_threadpool(core.diagnoses.from_excerpt, vehicle, noting(actor, "diagnose"))
+        await run_in_threadpool(core.diagnoses.from_excerpt, vehicle, noted)
+        return
     recording = body.recording
 
     def query(connection: Connection) -> RecordingRow:
@@ -140,7 +141,7 @@ async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
         return row
 
     row = await read(core, query)
-    return await run_in_threadpool(core.diagnoses.from_recording, row, None, noting(actor, "diagnose"))
+    await run_in_threadpool(core.diagnoses.from_recording, row, None, noted)
 
 
 async def _report(core: Core, actor: Actor, report_id: str) -> ReportRow:

@@ -1,29 +1,27 @@
 """`Idempotency-Key`: a request that is sent twice is carried out once.
 
 As in the draft of the IETF (draft-ietf-httpapi-idempotency-key-header): the first answer is kept for a day and given
-again; the same key for another request is refused, and so is one whose first request is still being worked on.  A
-request is its method, path and body; of an upload, the file, its name and the other fields count.  Keys of callers that
-differ in name, fleet or scopes have nothing to do with each other.  Answers age by the clock of retention, which takes
-no leap of the host's.
+again, also where the service was killed before it was sent; the same key for another request is refused, and so is one
+whose first request is still being worked on.  A request is its method, path and body; of an upload, the file, its name
+and the other fields count.  Keys of callers that differ in name, fleet or scopes have nothing to do with each other.
+Answers age by the clock of retention, which takes no leap of the host's.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, Header, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
-from sqlalchemy import Row, delete, select
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy import Connection, Row, delete, insert, select
+from sqlalchemy.exc import IntegrityError
 
-from sprung.model.text import first_line
 from sprung.service.api.access import CoreOf
 from sprung.service.api.actors import ActorOf
 from sprung.service.api.answers import json_response
@@ -32,11 +30,10 @@ from sprung.service.api.scopes import FORM, content_kind
 from sprung.service.api.uploads import identity_of
 from sprung.service.core import Core
 from sprung.service.housekeeping import LONGEST_PAUSE
-from sprung.service.store.engine import insert_or_ignore
 from sprung.service.store.schema import idempotency
 from sprung.service.times import NANOSECONDS
 
-log = logging.getLogger("sprung.api")
+T = TypeVar("T")
 KEPT = LONGEST_PAUSE + 86_400 * NANOSECONDS  # a day, though the host's clock leaps while the service is stopped
 Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=200, description="sent twice, carried out once")]
 
@@ -53,9 +50,7 @@ class KeysAtWork:
         """While a request is carried out; raises ApiProblem for a second one."""
         with self._lock:
             if key in self._keys:
-                raise ApiProblem(
-                    409, "a request with this Idempotency-Key is being worked on", headers={"Retry-After": "1"}
-                )
+                raise _at_work()
             self._keys.add(key)
         try:
             yield
@@ -74,27 +69,38 @@ class IdempotentRequests:
         self._http = request
         self._parts = parts
         self._upload = b""
+        self._response: Response | None = None
 
     def received(self, identity: str) -> None:
         """Set the identity of the upload, before the answer is kept."""
         self._upload = identity.encode()
 
-    async def answer(self, act: Callable[[], Awaitable[Response]]) -> Response:
-        """The answer of `act`, or the one that was given before.  Errors are not kept."""
+    def keeping(self, respond: Callable[[Connection, T], Response]) -> Callable[[Connection, T], None]:
+        """What a deed has to call inside its transaction with what came of it: makes the answer, and keeps it there.
+
+        So deed and answer are stored together or not at all, whenever the process dies.
+        """
+
+        def work(connection: Connection, found: T) -> None:
+            self._response = respond(connection, found)
+            if self._key is not None:
+                self._keep(connection, self._response)
+
+        return work
+
+    async def answer(self, act: Callable[[], Awaitable[None]]) -> Response:
+        """The answer that `act` has kept, or the one that was given before.  Errors are not kept."""
         if self._key is None:
-            return await act()
+            return await self._carried_out(act)
         at_work: KeysAtWork = self._http.app.state.keys_at_work
         with at_work.holding(self._key):
             kept = await run_in_threadpool(self._find)
-            if kept is not None:
-                return await self._again(kept)
-            response = await act()
-            try:
-                await run_in_threadpool(self._keep, response)
-            except (SQLAlchemyError, OSError) as error:
-                # it is done: told otherwise, the client would have it done twice
-                log.warning("the answer to an Idempotency-Key is not kept: %s", first_line(error))
-            return response
+            return await self._carried_out(act) if kept is None else await self._again(kept)
+
+    async def _carried_out(self, act: Callable[[], Awaitable[None]]) -> Response:
+        await act()
+        assert self._response is not None, "a deed without `keeping`"
+        return self._response
 
     def _find(self) -> Row[Any] | None:
         table, now = idempotency, self._core.housekeeping.clock.now(keep=False)
@@ -111,7 +117,7 @@ class IdempotentRequests:
         headers = {"Idempotency-Replayed": "true"} | ({"Location": kept.location} if kept.location else {})
         return json_response(kept.body, kept.status, headers)
 
-    def _keep(self, response: Response) -> None:
+    def _keep(self, connection: Connection, response: Response) -> None:
         row = {
             "key": self._key,
             "request": _digest(*self._parts, self._upload),
@@ -120,8 +126,14 @@ class IdempotentRequests:
             "location": response.headers.get("location"),
             "created_ns": self._core.housekeeping.clock.now(keep=False),
         }
-        with self._core.store.write() as connection:
-            insert_or_ignore(connection, idempotency, [row])
+        try:
+            connection.execute(insert(idempotency).values(**row))
+        except IntegrityError:  # another process has carried it out meanwhile; here it is undone
+            raise _at_work() from None
+
+
+def _at_work() -> ApiProblem:
+    return ApiProblem(409, "a request with this Idempotency-Key is being worked on", headers={"Retry-After": "1"})
 
 
 async def once(request: Request, core: CoreOf, actor: ActorOf, key: Key = None) -> IdempotentRequests:

@@ -9,16 +9,18 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
+from sprung.service.access.tokens import Actor
 from sprung.service.api import job_models
-from sprung.service.api.access import CoreOf, noting, read
+from sprung.service.api.access import CoreOf, read
 from sprung.service.api.actors import ActorOf, own_vehicle
 from sprung.service.api.answers import json_response
-from sprung.service.api.idempotency import OnceOf
+from sprung.service.api.idempotency import IdempotentRequests, OnceOf
 from sprung.service.api.uploads import BODY, receive
 from sprung.service.errors import NotFound
-from sprung.service.store import work
+from sprung.service.jobs.queue import Noted
+from sprung.service.store import audit, work
 from sprung.service.store.work import JobRow
-from sprung.service.times import to_iso
+from sprung.service.times import now_ns, to_iso
 
 router = APIRouter(tags=["recordings"])
 
@@ -39,14 +41,13 @@ async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -
     runs, that job is the answer.
     """
 
-    async def act() -> Response:
+    async def act() -> None:
         core.jobs.reserve()
         async with receive(request, core) as found:
             once.received(found.identity)
             own_vehicle(actor, found.vehicle)
-            noted = noting(actor, "upload", {"name": found.row.name, "vehicle": found.vehicle})
-            job = await run_in_threadpool(core.jobs.submit, "recording", found.row, found.vehicle, noted)
-        return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
+            noted = noting(actor, "upload", once, {"name": found.row.name, "vehicle": found.vehicle})
+            await run_in_threadpool(core.jobs.submit, "recording", found.row, found.vehicle, noted)
 
     return await once.answer(act)
 
@@ -71,6 +72,21 @@ async def cancel(core: CoreOf, actor: ActorOf, id: str) -> Response:
     await job(core, actor, id)
     row = await run_in_threadpool(core.jobs.cancel, id, actor.name)
     return json_response(job_dict(row))
+
+
+def noting(actor: Actor, action: str, once: IdempotentRequests, detail: dict[str, str | None] | None = None) -> Noted:
+    """Writes who asked for a job into the audit log, and keeps the answer, in the transaction that stores the job."""
+    keep = once.keeping(_accepted)
+
+    def work(connection: Connection, job: JobRow) -> None:
+        audit.record(connection, actor.name, action, job.id, detail or {"vehicle": job.vehicle_id}, now_ns())
+        keep(connection, job)
+
+    return work
+
+
+def _accepted(_: Connection, job: JobRow) -> Response:
+    return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
 
 
 def job_dict(row: JobRow) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from sprung.service.api.queries import Id, Version
 from sprung.service.core import Core
 from sprung.service.diagnosis.task import IMPROVED
 from sprung.service.errors import NotFound, UserError
+from sprung.service.operations import Noted
 from sprung.service.store import fleet, vehicle_models, work
 from sprung.service.store.vehicle_models import SERVICE_FILE, ModelVersion
 from sprung.service.times import optional_iso, to_iso
@@ -61,24 +62,25 @@ async def use(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: ModelBo
         detail = "give one of report, version and system"
         raise ApiProblem(422, detail, [{"field": "report", "detail": detail}])
 
-    async def act() -> Response:
+    def respond(connection: Connection, _: int) -> Response:
+        return json_response(models_answer(core, connection, id_))
+
+    async def act() -> None:
         try:
             async with core.trying:
-                await _use(core, actor, id_, body)
+                await _use(core, actor, id_, body, once.keeping(respond))
         except UserError as error:
             raise ApiProblem(422, str(error), [{"field": "system", "detail": str(error)}]) from error
-        return json_response(await read(core, lambda connection: models_answer(core, connection, id_)))
 
-    answer: Response = await once.answer(act)
-    return answer
+    return await once.answer(act)
 
 
-async def _use(core: Core, actor: Actor, vehicle: str, body: ModelBody) -> None:
+async def _use(core: Core, actor: Actor, vehicle: str, body: ModelBody, noted: Noted[int]) -> None:
     if body.version is not None:
-        await run_in_threadpool(core.operations.use_model, actor.name, vehicle, body.version)
+        await run_in_threadpool(core.operations.use_model, actor.name, vehicle, body.version, noted)
         return
     text = body.system if body.system is not None else await _of_report(core, actor, vehicle, body.report or "")
-    await run_in_threadpool(core.operations.give_model, actor.name, vehicle, text, body.report)
+    await run_in_threadpool(core.operations.give_model, actor.name, vehicle, text, body.report, noted)
 
 
 @router.get("/vehicles/{id}/models", summary="A vehicle's models", response_model=models.VehicleModels)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import io
 import json
 import re
+import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,7 @@ import pytest
 from fastapi.testclient import TestClient
 from mcap.reader import make_reader
 from sqlalchemy import String, Text, select
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import IntegrityError, OperationalError
 
 from sprung.model.system import System, parse_system
 from sprung.service.api import signals
@@ -104,17 +107,55 @@ def test_the_same_key_does_the_same_thing_once(client: TestClient, broken: str) 
     assert len(client.get("/jobs").json()["jobs"]) == 1
 
 
-def test_what_is_done_is_answered_so_also_where_the_answer_cannot_be_kept(
-    client: TestClient, broken: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("path", "request_"),
+    [
+        ("/vehicles/a/notes", {"json": {"text": "seen"}}),
+        ("/vehicles/a/maintenance", {"json": {"text": "overhaul"}}),
+        ("/vehicles/a/acknowledge", {"json": {}}),
+        ("/recordings", {"files": {"file": ("ride.csv", "time,a\n0,1\n")}}),
+    ],
+)
+def test_what_a_killed_service_had_done_is_not_done_again(
+    client: TestClient, core: Core, broken: str, data_dir: Path, path: str, request_: dict[str, Any]
 ) -> None:
-    """An error would have the client send it again, and it would be done twice."""
+    """The answer never came, so the client sends the request once more."""
+    request_ |= {"headers": {"Idempotency-Key": "k1"}}
+    command = [sys.executable, "-m", "tests.killed_service", str(data_dir), path, json.dumps(request_)]
+    died = subprocess.run(command, capture_output=True, check=False, text=True)
+    assert died.returncode == -signal.SIGKILL, died.stderr
+    done, marks, jobs = deeds(core), client.get("/vehicles/a/marks").json(), client.get("/jobs").json()
+    assert len(done) == 1
+    again = client.post(path, **request_)
+    assert again.is_success and again.headers["idempotency-replayed"] == "true"
+    assert (deeds(core), client.get("/vehicles/a/marks").json(), client.get("/jobs").json()) == (done, marks, jobs)
+    if path == "/recordings":
+        assert again.headers["location"] == f"/jobs/{jobs['jobs'][0]['id']}"
 
-    def locked(*_: Any) -> None:
-        raise OperationalError("INSERT", {}, Exception("database is locked"))
 
-    monkeypatch.setattr("sprung.service.api.idempotency.insert_or_ignore", locked)
-    answer = client.post("/vehicles/a/notes", json={"text": "seen"}, headers={"Idempotency-Key": "k1"})
-    assert answer.status_code == 201
+@pytest.mark.parametrize(("error", "status"), [(OperationalError, 503), (IntegrityError, 409)])
+def test_what_cannot_be_kept_is_not_done(
+    client: TestClient,
+    core: Core,
+    broken: str,
+    monkeypatch: pytest.MonkeyPatch,
+    error: type[OperationalError],
+    status: int,
+) -> None:
+    """The client sends it again: done without the note of its answer, it would be done twice.
+
+    The store is locked, or another process has carried out the same request meanwhile.
+    """
+
+    def refused(*_: Any) -> None:
+        raise error("INSERT", {}, Exception("database is locked"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sprung.service.api.idempotency.insert", refused)
+        answer = client.post("/vehicles/a/notes", json={"text": "seen"}, headers={"Idempotency-Key": "k1"})
+        assert answer.status_code == status and "retry-after" in answer.headers
+        assert client.get("/vehicles/a/marks").json()["marks"] == [] and deeds(core) == []
+    assert client.post("/vehicles/a/notes", json={"text": "seen"}, headers={"Idempotency-Key": "k1"}).status_code == 201
     assert len(client.get("/vehicles/a/marks").json()["marks"]) == 1
 
 
