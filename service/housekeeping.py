@@ -119,18 +119,27 @@ class Housekeeping:
             self._thread.join()
 
     def clear_leftovers(self) -> list[str]:
-        """Delete incomplete files of a killed process, before anything is accepted.  Returns their names."""
+        """Delete what a killed process left incomplete, or the store does not know, before anything is accepted.
+
+        A store that knows no file of a folder may be a new one beside the files of another: then only what is
+        incomplete goes.  Returns the names.
+        """
         with self._store.read() as connection:
-            kept = work.stored_files(connection)
-        left = [path for path in _entries(self._settings.uploads) if path.name not in kept]
-        left += [path for path in _entries(self._settings.reports) if path.name.endswith(".part")]
+            kept = {self._settings.uploads: work.stored_files(connection)}
+            kept[self._settings.reports] = work.kept_reports(connection)
+        left = [
+            path
+            for folder, names in kept.items()
+            for path in _entries(folder)
+            if path.name not in names and (names or path.name.endswith(".part"))
+        ]
         for path in left:
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             else:
                 path.unlink(missing_ok=True)
         if left:
-            log.warning("%d files that were left half written are deleted", len(left))
+            log.warning("%d files that a killed process left behind are deleted", len(left))
         return [path.name for path in left]
 
     def once(self, now: int, keep: bool = True) -> retention.RetentionResult:

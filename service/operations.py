@@ -187,18 +187,28 @@ class Operations:
             self._forget(vehicle)
 
     def remove(self, actor: str, vehicle: str) -> None:
-        """Delete a vehicle with all its data: windows, alarms, reports, uploaded files.  Raises NotFound."""
+        """Delete a vehicle with all its data: windows, alarms, reports, uploaded files.  Raises NotFound.
+
+        The store comes after the archive: where the process is killed in between, the vehicle is there to be deleted
+        again.  Files that the store knows nothing of any more are deleted at the next start, too.
+        """
+        with self._store.read() as connection:
+            self._known(fleet.vehicle_exists(connection, vehicle), vehicle)
+        self._remove_archived(vehicle)
         with self._store.write() as connection:
             self._known(fleet.vehicle_exists(connection, vehicle), vehicle)
             removed = marks.remove(connection, vehicle)
             audit.record(connection, actor, "delete", vehicle, None, now_ns())
         self._forget(vehicle)
-        if self._archive is not None:
-            self._archive.remove(vehicle)
+        self._remove_archived(vehicle)  # what was archived meanwhile
         for name in removed.upload_files:
             (self._settings.uploads / name).unlink(missing_ok=True)
         for report in removed.reports:
             shutil.rmtree(self._settings.reports / report, ignore_errors=True)
+
+    def _remove_archived(self, vehicle: str) -> None:
+        if self._archive is not None:
+            self._archive.remove(vehicle)
 
     @staticmethod
     def _known(found: bool, vehicle: str) -> None:

@@ -127,8 +127,12 @@ class DiagnosisJobs:
 
     def run(self, job: JobRow, progress: Progress) -> dict[str, Any]:
         """Handler of jobs of kind `diagnosis`; returns the report's id and verdict."""
+        report_id = job.id  # one report a job
+        with self._store.read() as connection:
+            kept = work.get_report(connection, report_id)
+        if kept is not None:  # the service was killed before the job was noted as done
+            return {"report": report_id, "verdict": kept.verdict}
         path, row = stored_file(self._settings, self._store, job)
-        report_id = job.id  # one report a job: a job that is done again overwrites its own
         vehicle = job.vehicle_id
         with self._store.read() as connection:
             served = self._engines.shared if vehicle is None else self._engines.of(connection, vehicle)

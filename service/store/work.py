@@ -176,6 +176,11 @@ def stored_files(connection: Connection) -> set[str]:
     return set(connection.execute(select(recordings.c.file).where(recordings.c.file.is_not(None))).scalars())
 
 
+def kept_reports(connection: Connection) -> set[str]:
+    """Ids of the reports, which are names inside the report folder."""
+    return set(connection.execute(select(reports.c.id)).scalars())
+
+
 def stored_bytes(connection: Connection) -> int:
     """Bytes of the uploads and excerpts that are kept."""
     query = select(func.coalesce(func.sum(recordings.c.size_bytes), 0)).where(

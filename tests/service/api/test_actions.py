@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import httpx2
 import jsonschema
@@ -27,9 +27,11 @@ from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.housekeeping import DAY
 from sprung.service.monitoring.engine import Engine
+from sprung.service.operations import Operations
 from sprung.service.rendering.drawing import Mark, columns, plan_view, side_view, small_view
 from sprung.service.settings import Settings
 from sprung.service.store import outbox, retention, work
+from sprung.service.store.archive import Archive
 from sprung.service.store.schema import audit, metadata
 from sprung.service.times import from_iso
 from tests.clocks import Clocks
@@ -157,6 +159,22 @@ def test_what_cannot_be_kept_is_not_done(
         assert client.get("/vehicles/a/marks").json()["marks"] == [] and deeds(core) == []
     assert client.post("/vehicles/a/notes", json={"text": "seen"}, headers={"Idempotency-Key": "k1"}).status_code == 201
     assert len(client.get("/vehicles/a/marks").json()["marks"]) == 1
+
+
+def test_a_deletion_that_was_killed_half_way_can_be_repeated(client: TestClient, core: Core, broken: str) -> None:
+    """Deleted in the store first, nobody could ask for what is left of it in the archive."""
+
+    class Killed(BaseException):
+        pass
+
+    class ArchiveThatDies:
+        def remove(self, vehicle: str) -> int:
+            raise Killed
+
+    operations = Operations(core.settings, core.pipeline, lambda vehicle: None, cast(Archive, ArchiveThatDies()))
+    with pytest.raises(Killed):
+        operations.remove("me", "a")
+    assert client.delete("/vehicles/a?confirm=a").status_code == 204
 
 
 @pytest.mark.parametrize("deed", ["notes", "maintenance"])

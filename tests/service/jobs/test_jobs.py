@@ -285,16 +285,48 @@ def test_a_file_that_is_sent_twice_is_kept_once_and_diagnosed_once_at_a_time(cor
 
 def test_what_a_dead_process_left_half_written_is_deleted_at_start(core: Core) -> None:
     uploads, reports = core.settings.uploads, core.settings.reports
-    for path in (uploads / "a.mcap.part", uploads / "nobodys.csv", uploads / "kept.csv", reports / "x.7.part" / "y"):
+    half = (uploads / "a.mcap.part", reports / "x.7.part" / "y")
+    unknown = (uploads / "nobodys.csv", reports / "of a vehicle that was deleted" / "report.html")
+    for path in (*half, *unknown, uploads / "kept.csv", reports / "kept" / "report.html"):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("x")
     with core.store.write() as connection:
         work.add_recording(
             connection, work.RecordingRow("r", None, "n", "upload", "kept.csv", 1, None, time.time_ns(), None)
         )
+        work.add_report(connection, work.ReportRow("kept", None, "r", "consistent", {}, 1))
     with TestClient(create_app(core)):
         assert [path.name for path in uploads.iterdir()] == ["kept.csv"]
-        assert list(reports.iterdir()) == []
+        assert [path.name for path in reports.iterdir()] == ["kept"]
+
+
+def test_files_of_a_store_that_was_moved_away_stay(core: Core) -> None:
+    """Somebody moves a damaged store aside and starts the service before the other one is in its place."""
+    kept = (core.settings.uploads / "a.csv", core.settings.reports / "r" / "report.html")
+    half = core.settings.uploads / "b.csv.part"
+    for path in (*kept, half):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("x")
+    with TestClient(create_app(core)):
+        assert all(path.exists() for path in kept) and not half.exists()
+
+
+def test_a_diagnosis_whose_report_is_kept_is_not_made_again(core: Core) -> None:
+    """The service was killed after it had stored the report, and before it noted that the job was done."""
+    with TestClient(create_app(core)) as client:
+        job = ask_for(client, "good.mcap")
+        assert eventually(lambda: stored(core.store, job).state == "done")
+        page = core.settings.reports / job
+        before = page.stat().st_ino
+    core.diagnosis_jobs.task = no_task
+    with core.store.write() as connection:
+        work.update_job(connection, job, 1, state="running", attempts=1, result=None)
+    again = core.diagnosis_jobs.run(stored(core.store, job), Progress(lambda share: None, threading.Event(), 60.0))
+    assert again["report"] == job and page.stat().st_ino == before
+
+
+def no_task(_request: DiagnosisRequest, _emit: Emit[Stage]) -> DiagnosisResult:
+    pytest.fail("the diagnosis is made again")
 
 
 def test_a_cancelled_reading_ends_with_its_reason(store: Store) -> None:
