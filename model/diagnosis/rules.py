@@ -431,6 +431,9 @@ class ComponentRules:
     )
     at_noise: float = rule(1.2, "of the power of the record's own noise; derived: a level's scatter", 1.1, 1.4)
     drift: float = rule(0.05, "of the record, within which a change is no drift but its beginning; chosen", 0.03, 0.1)
+    drift_powers: int = rule(5, "of the time, of a zero that drifts; chosen: an amplifier that warms up", 3, 7)
+    drift_turns: float = rule(4.0, "of the motion for each of them; derived: a drift is slower than a cycle", 3.0, 8.0)
+    slow: int = rule(40, "slowest changes, among which a drift stands out; chosen: its powers are few", 30, 60)
     as_well: float = rule(1.05, "of the held-out power, up to which a plainer law serves as well; chosen", 1.02, 1.1)
     by_lag: float = rule(0.95, "of the excess power, that a late channel explains; chosen", 0.9, 0.98)
     above: float = rule(

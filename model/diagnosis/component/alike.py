@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from sprung.model.diagnosis.component.drifting import with_drift_instead
 from sprung.model.diagnosis.force.deviations import moved_in_common
 from sprung.model.diagnosis.force.fit import ComponentFit, refined
 from sprung.model.diagnosis.force.lag import Lag
@@ -45,6 +46,8 @@ def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple
     for index, step in enumerate(steps, first):
         valve = low_valve(here, index)
         found += [EquivalentModel(index, valve, here)] if valve is not None and _as_well(valve, here) else []
+        drift = with_drift_instead(here, index)
+        found += [EquivalentModel(index, drift, here)] if drift is not None and _as_well(drift, here) else []
         near = step.chosen.evidence - task.rules.naming_margin
         for other in (*step.rivals, *step.forms):
             if other.evidence > near or here.leaves_more:

@@ -10,6 +10,7 @@ from sprung.model.diagnosis.component.alike import gives_way
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.judgement import ComponentJudgement, JudgedComponent
 from sprung.model.diagnosis.component.words import (
+    drift_finding,
     finding_of,
     late_finding,
     leftover_words,
@@ -20,6 +21,7 @@ from sprung.model.diagnosis.component.words import (
 from sprung.model.diagnosis.force.deviations import covariance, spread
 from sprung.model.diagnosis.force.fit import ComponentFit
 from sprung.model.diagnosis.force.lag import Lag
+from sprung.model.diagnosis.force.zero_drift import ZeroDrift
 from sprung.model.diagnosis.investigation.state import Options, Recorded
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import (
@@ -102,10 +104,14 @@ def _findings(one: JudgedComponent) -> list[Finding]:
     if one.unnamed is not None:
         mapped = one.surface is not None
         findings.append(unknown_finding(one.record.element, one.unnamed, one.found.steps, mapped=mapped))
+    for index, piece in enumerate(one.record.given.pieces):
+        if isinstance(piece, ZeroDrift):
+            of_drift = spread(one.final, index, full, names)[0]
+            findings.append(drift_finding(one.record.sensor, one.record.element, one.final, index, of_drift))
     deviation, by_chance = (float(np.sqrt(max(of[0, 0], 0.0))) for of in (full, one.by_chance[0]))
     sign = -1.0 if one.reversed else 1.0
     least = one.final.task.rules.preload * max(by_chance, one.floor / np.sqrt(one.record.task.split))
-    if abs(one.final.preload) > least:
+    if abs(one.final.preload) > max(least, deviation):
         findings.append(preload_finding(one.record.element, sign * one.final.preload, deviation))
     return findings
 

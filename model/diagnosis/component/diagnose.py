@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.component.compose import compose_components
+from sprung.model.diagnosis.component.drifting import drifts, possible_drift
 from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.judgement import JudgedComponent, concluded
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
@@ -19,7 +20,7 @@ from sprung.model.diagnosis.force.piece import HYSTERESIS, Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.ranking import Ranked, Step, determined
 from sprung.model.diagnosis.force.search import Progress as PieceProgress
-from sprung.model.diagnosis.force.search import search
+from sprung.model.diagnosis.force.search import Search, search
 from sprung.model.diagnosis.force.slider_surface import SURFACE
 from sprung.model.diagnosis.investigation.state import Options, Progress, Recorded
 from sprung.model.diagnosis.report.report import Report
@@ -76,7 +77,7 @@ def _judge(
     turned = turned_round(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
-    found = search(one.task, (*pieces, *one.own), progress, one.given)
+    one, found = _searched(one, pieces, progress)
     base, final = found.base, found.final
     judged = JudgedComponent(one, found, base, final, final.floor, turned)
     alone = _only_one_loop(judged)
@@ -92,6 +93,21 @@ def _judge(
         progress("remaining force as an unnamed force")
         judged = replace(_with_surface(_closest(judged)), named=False)
     return judged
+
+
+def _searched(
+    one: ComponentRecord, pieces: tuple[Piece, ...], progress: PieceProgress
+) -> tuple[ComponentRecord, Search]:
+    """The laws of a record; with a drift of the zero among what is given, if these with it are the record's."""
+    candidates = (*pieces, *one.own)
+    found = search(one.task, candidates, progress, one.given)
+    drift = possible_drift(found, one.given)
+    if drift is None:
+        return one, found
+    progress("laws beside a drift of the zero")
+    given = one.given.plus(drift, ())
+    beside = search(one.task, candidates, progress, given)
+    return (replace(one, given=given), beside) if drifts(beside, found, given) else (one, found)
 
 
 def _only_one_loop(judged: JudgedComponent) -> bool:

@@ -146,6 +146,14 @@ def preload_finding(element: str, value: float, sigma: float) -> Finding:
     )
 
 
+def drift_finding(sensor: str, element: str, fit: ComponentFit, index: int, sigma: FloatArray) -> Finding:
+    """A slow drift of a load cell's zero, the piece `index` of a fit.  Never a fault; sigma (2,): of its values."""
+    piece, values = fit.model.pieces[index], _parameters(fit.values(index), sigma)
+    what = f"{sensor}: its zero, or the static load of {element}, drifts by {values[0].words()}"
+    sentence = f"{what} in the course of the record"
+    return Finding(sensor, piece.effect, piece.effect_kind, values, None, None, sentence=sentence)
+
+
 def unknown_finding(element: str, step: Step, laws: tuple[Step, ...], *, mapped: bool) -> Finding:
     """An unexplained force; the closest laws are mentioned in the sentence.
 

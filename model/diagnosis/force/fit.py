@@ -13,6 +13,7 @@ from sprung.model.diagnosis.force.motion import ElementMotion
 from sprung.model.diagnosis.force.parts import Part
 from sprung.model.diagnosis.force.piece import Values
 from sprung.model.diagnosis.force.sizes import MotionSizes
+from sprung.model.diagnosis.force.zero_drift import ZeroDrift
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.along import force_along
@@ -153,6 +154,11 @@ class ComponentModel:
         return tuple(sign for piece in self.pieces for sign in piece.signs)
 
     @property
+    def wandering(self) -> tuple[bool, ...]:
+        """Which columns are a drift of the zero, (m,)."""
+        return tuple(isinstance(piece, ZeroDrift) for piece in self.pieces for _ in piece.signs)
+
+    @property
     def count(self) -> int:
         """Number of free values of the laws."""
         return sum(len(p.signs) + len(p.shapes) for p in self.pieces)
@@ -255,7 +261,7 @@ def bounded_solution(columns: FloatArray, target: FloatArray, signs: tuple[int, 
 
 
 def fitted(task: ComponentTask, model: ComponentModel) -> ComponentFit:
-    """Strengths, preload, spring and damper for given shapes."""
+    """Strengths, preload, spring and damper for given shapes, on the fitted part; a drift of the zero on the whole."""
     base, free, force = task.through(model.channel).linear
     columns = np.column_stack([base, model.columns(task)])
     late = model.channel.delay + _FORGETS * model.channel.lag
@@ -269,6 +275,12 @@ def fitted(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     values = np.array([0.0, task.nominal.stiffness or 0.0, task.nominal.damping or 0.0])
     values[free] = solved[: int(free.sum())]
     residual = force - columns @ solved
+    if any(model.wandering):  # beside the preload, which is the first column
+        zero = np.array([True, *[False] * (len(solved) - 1 - len(model.wandering)), *model.wandering])
+        moved = np.linalg.lstsq(columns[:, zero], residual)[0]
+        solved[zero] += moved
+        residual -= columns[:, zero] @ moved
+        values[0] = solved[0]
     element = SpringDamper(float(values[1]), float(values[2]))
     return ComponentFit(task, model, float(values[0]), element, solved[int(free.sum()) :], residual)
 
