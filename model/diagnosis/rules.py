@@ -368,7 +368,7 @@ class SetupRules:
     segments: int = rule(8, "of a recording, for a frequency response without a model; chosen", 5, 16)
     unexcited: float = rule(0.01, "of the largest power of a force, below which it excites nothing; chosen", 3e-3, 0.03)
     onset: float = rule(8.0, "times what precedes an impulse, of a response that begins with it; chosen", 5.0, 12.0)
-    first: float = rule(0.5, "of the largest response, that the first is; derived: the first is the largest", 0.3, 0.8)
+    first: float = rule(0.5, "of the largest that the first is, and of it before; derived: it is the largest", 0.3, 0.8)
 
 
 @dataclass(frozen=True)

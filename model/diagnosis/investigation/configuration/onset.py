@@ -3,7 +3,8 @@
 A force first moves its own point in its own direction, whatever the structure is made of: the velocity of the point
 after a unit impulse begins at F^T M^-1 F > 0, and never exceeds this value in magnitude afterwards.  If it begins
 negative, the sign of the force or of the sensor at its point is reversed.  A delay between the two shows as a later
-beginning, and what precedes the impulse is noise.
+beginning, and what precedes the impulse is noise.  Below all resonances a force is that of a spring, whose velocity
+leads it: within such a band the response swings as far before the impulse as after, and shows no beginning.
 """
 
 from __future__ import annotations
@@ -50,8 +51,11 @@ def begins_backwards(force: FloatArray, velocity: FloatArray, compared: float, r
     start = length // 2
     early = response[start : start + max(2, int(np.ceil(quarter)))]
     first = float(early[int(np.argmax(np.abs(early)))])
-    noise = float(np.sqrt(np.mean(response[: start - int(np.ceil(2 * quarter))] ** 2)))
-    return first < -rules.onset * noise and -first > rules.first * float(np.max(np.abs(response)))
+    before = start - int(np.ceil(2 * quarter))
+    noise = float(np.sqrt(np.mean(response[:before] ** 2)))
+    leading = float(np.max(np.abs(response[before : start - max(1, int(quarter / 2))])))  # later: smeared by the edge
+    begins = leading < rules.first * abs(first) and abs(first) > rules.first * float(np.max(np.abs(response)))
+    return begins and first < -rules.onset * noise
 
 
 def velocity_of(part: Part, kind: int, column: int) -> FloatArray:

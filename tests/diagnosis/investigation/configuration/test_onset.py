@@ -54,6 +54,15 @@ def test_noise_and_a_single_frequency_have_no_beginning() -> None:
     assert not backwards(np.sin(30 * time), -np.sin(30 * time + 0.3))
 
 
+@pytest.mark.parametrize("resonance", [15.0, 20.0, 40.0])
+def test_a_force_below_every_resonance_shows_no_beginning(resonance: float) -> None:
+    """A spring's velocity leads its force: within a band it is as large before an impulse as it is after."""
+    force, natural = push(3, band=10.0), 2 * np.pi * resonance
+    mobility = 1j * OMEGA / (natural**2 - OMEGA**2 + 0.1j * natural * OMEGA)
+    velocity = np.fft.irfft(mobility * np.fft.rfft(force), SAMPLES)
+    assert not backwards(force, velocity)
+
+
 def test_a_driving_point_has_a_motion_sensor_at_the_only_force() -> None:
     system = parse_system(TOWER)
     assert driving_point(system.mechanics) == 2
