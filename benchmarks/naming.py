@@ -25,6 +25,7 @@ from scipy.signal import butter, chirp, sosfiltfilt
 from sprung.benchmarks.naming_rigs import RIGS, TRAVEL, RigKind
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.force.motion import element_motion
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Finding
 from sprung.model.laws import ElementLaw, SpringDamper, find_law
 from sprung.model.laws.along import force_along
@@ -77,7 +78,7 @@ def judged(rig: RigKind, motion: str, seed: list[int]) -> dict[str, Any]:
         report = diagnose(SIGNALLED if rig.signal else BENCH, record, Options(file=motion))
     except DiagnosisError as refused:
         return {"judged": "refused", "said": str(refused)}
-    found = [f for f in report.findings if f.effect != "preload"]
+    found = [f for f in report.findings if f.kind is not EffectKind.NUISANCE]
     line: dict[str, Any] = {
         "verdict": report.verdict,
         "said": {f.effect: {p.name: [p.value, p.std] for p in (*f.parameters, *f.quoted)} for f in found},
