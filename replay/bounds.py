@@ -30,6 +30,17 @@ MDF_ZIPPED = struct.Struct(
 )  # id, length, links, of which block, method, parameter, bytes, packed bytes
 MDF_GROUP = struct.Struct("<4s4xQQ48xQQHH4xII")  # id, length, links, record id, records, flags, -, bytes, further bytes
 READ = 1 << 20  # bytes of packed data that are looked at at once
+MDF_HEADER, MDF_FIRST_LINK = 64, 24  # where the header block lies, and its links in any block
+MDF_LINK = struct.Struct("<Q")
+MDF_LINKS: dict[str, tuple[tuple[int, str], ...]] = {  # of a kind of block: number of the link, and to what kind
+    "header": ((0, "DG"), (1, "listed"), (3, "listed"), (4, "listed")),  # groups; history, attachments, events
+    "listed": ((0, "listed"),),
+    "DG": ((0, "DG"), (1, "CG"), (2, "data")),
+    "CG": ((0, "CG"), (1, "CN")),
+    "CN": ((0, "CN"), (1, "composition"), (5, "data")),
+}
+MDF_PARTS = {b"##CN": "CN", b"##CA": "listed"}  # what a channel may be composed of
+MDF_LISTS = (b"##HL", b"##DL", b"##LD")  # what data may be listed in
 VARIABLE = 1  # flag of a group whose records have lengths of their own
 
 
@@ -135,6 +146,40 @@ def mdf_sizes(path: Path) -> Iterator[int]:
                     begin = at + MDF_ZIPPED.size
                     ends = range(begin, begin + packed, READ)
                     yield from map(len, _inflated(data[a : min(a + READ, begin + packed)] for a in ends))
+
+
+def check_mdf_links(path: Path) -> None:
+    """Raise UnreadableRecording for an MDF 4 file of which two blocks, or one and itself, lead to the same next one.
+
+    asammdf follows lists of blocks to their end, wherever they lead: in a circle it would go on for ever.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        waiting, reached = [(MDF_HEADER, "header")], {MDF_HEADER}
+        while waiting:
+            at, kind = waiting.pop()
+            for number, to in MDF_LINKS[kind]:
+                link = at + MDF_FIRST_LINK + 8 * number
+                if link + MDF_LINK.size > len(data):
+                    continue
+                (target,) = MDF_LINK.unpack_from(data, link)
+                role = _role(to, data[target : target + 4])
+                if not 0 < target < len(data) or role is None:
+                    continue
+                if target in reached:
+                    raise UnreadableRecording(
+                        f"{path}: damaged: its blocks lead to byte {target} twice, so that reading would not end"
+                    )
+                reached.add(target)
+                waiting.append((target, role))
+
+
+def _role(to: str, name: bytes) -> str | None:
+    """What a block is read as, that is linked to as `to`; None where it leads nowhere."""
+    if to == "composition":
+        return MDF_PARTS.get(name)
+    if to == "data":
+        return "listed" if name in MDF_LISTS else None
+    return to
 
 
 def _pieces(file: BinaryIO, size: int) -> Iterator[bytes]:

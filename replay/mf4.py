@@ -16,7 +16,7 @@ import numpy as np
 
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.bounds import check_whole, mdf_sizes
+from sprung.replay.bounds import MDF_HEADER, check_mdf_links, check_whole, mdf_sizes
 from sprung.replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
 from sprung.replay.plausibility import EARLIEST, LATEST, OUT_OF_TIME
 
@@ -32,10 +32,14 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
     except ImportError:
         raise UnreadableRecording(f"{path}: reading MF4 needs asammdf; install sprung[mf4]") from None
     with path.open("rb") as file:
-        head = file.read(64)
+        head = file.read(MDF_HEADER + 2)
     if head[:8].strip() not in SIGNATURES:
         raise UnreadableRecording(f"{path}: not an MDF file: {'it does not begin as one' if head else 'it is empty'}")
+    if head[MDF_HEADER : MDF_HEADER + 2] == b"HD":
+        version = head[8:16].decode("ascii", "replace").strip(" \0") or "?"
+        raise UnreadableRecording(f"{path}: an MDF file of version {version}; bus logs are read from version 4 on")
     check_whole(path, mdf_sizes(path))
+    check_mdf_links(path)
     unfinished = bool(int.from_bytes(head[UNFINISHED : UNFINISHED + 4], "little"))
     with _quietly():
         wrong = ""

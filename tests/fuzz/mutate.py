@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from sprung.replay.blf import CONTAINER, CONTAINER_TYPE, OBJECT_BASE
 from sprung.replay.mcapfile import CHUNK, MAGIC, PREFIX
 
 Random = np.random.Generator
+MDF_BLOCK = re.compile(rb"##[A-Z]{2}\0{4}")
 INTEGERS = [0, 1, 2, 127, 128, 255, 256, 32767, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**53, 2**63 - 1, 2**63, 2**64 - 1]
 TOKENS = [
     *(
@@ -162,5 +164,20 @@ def inside_blf(data: bytes, rng: Random) -> bytes:
     return data[:at] + whole + bytes(len(whole) % 4) + data[at + size + size % 4 :]
 
 
+def inside_mf4(data: bytes, rng: Random) -> bytes:
+    """Links of an MDF file that lead to another of its blocks, or back: nothing gives it away."""
+    changed = bytearray(data)
+    blocks = [found.start() for found in MDF_BLOCK.finditer(data)]
+    links = [
+        at + 24 + 8 * number
+        for at in blocks
+        for number in range(min(int.from_bytes(data[at + 16 : at + 24], "little"), 20))
+    ]
+    for _ in range(int(rng.integers(1, 4))):
+        link = links[int(rng.integers(len(links)))]
+        changed[link : link + 8] = blocks[int(rng.integers(len(blocks)))].to_bytes(8, "little")
+    return bytes(changed)
+
+
 INSIDE: dict[str, Callable[[bytes, Random], bytes]] = {"mcap": inside_mcap, "blf": inside_blf}
-INSIDE |= {"mcap-protobuf": inside_mcap, "mcap-ros2": inside_mcap}
+INSIDE |= {"mcap-protobuf": inside_mcap, "mcap-ros2": inside_mcap, "mf4": inside_mf4}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import time
 import zlib
@@ -173,3 +174,27 @@ def test_an_mdf_group_that_states_records_without_end_is_refused(tmp_path: Path)
         data[at + 80 : at + 88] = (1 << 45).to_bytes(8, "little")  # after id, length, number of links, six of them, id
     (tmp_path / name).write_bytes(data)
     assert groups and "unpacks to more than" in refused(tmp_path / name)
+
+
+def test_mdf_blocks_that_lead_in_a_circle_are_refused(tmp_path: Path) -> None:
+    """Next of the header, of the history, of groups and of channels: asammdf followed each of them for ever."""
+    pytest.importorskip("asammdf")
+    name, write = SEEDS["mf4"]
+    write(tmp_path / name)
+    whole = (tmp_path / name).read_bytes()
+    blocks = [found.start() for found in re.finditer(rb"##(HD|FH|DG|CG|CN)\0{4}", whole)]
+    kinds = {whole[at : at + 4] for at in blocks}
+    assert kinds == {b"##HD", b"##FH", b"##DG", b"##CG", b"##CN"}
+    for kind in sorted(kinds):
+        own = [at for at in blocks if whole[at : at + 4] == kind]
+        for at, target in ((own[0], own[0]), (own[-1], own[0])):
+            data = bytearray(whole)
+            data[at + 24 : at + 32] = target.to_bytes(8, "little")
+            (tmp_path / name).write_bytes(data)
+            assert "so that reading would not end" in refused(tmp_path / name), kind
+
+
+def test_an_mdf_file_of_an_older_version_is_refused_with_the_reason(tmp_path: Path) -> None:
+    pytest.importorskip("asammdf")
+    (tmp_path / "a.mf4").write_bytes(b"MDF     3.30    ".ljust(64, b"\0") + b"HD".ljust(400, b"\0"))
+    assert "of version 3.30; bus logs are read from version 4 on" in refused(tmp_path / "a.mf4")
