@@ -110,6 +110,12 @@ class FitRules:
     )
     unsettled: float = rule(0.6, "last fall, beyond which a fit is compared with none; derived: a tenth of 6", 0.3, 1.0)
     smoothing: float = rule(5e-4, "of chi-square, by which smoothing the inputs anew may move it; chosen", 2e-4, 1e-3)
+    told: float = rule(
+        2.0,
+        "promised fall, up to which a failed step ends a fit if smoothing moves as much; derived: a third of 6",
+        1.0,
+        3.0,
+    )
     patience: float = rule(1.0, "times the steps of every fit, which converge before; chosen", 0.7, 1.5)
     restarts: int = rule(5, "of a fit that has not converged; chosen", 3, 8)
     restarted: int = rule(10, "steps of each; chosen", 6, 15)

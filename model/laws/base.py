@@ -93,6 +93,11 @@ class Parametrised:
         return self.where in ("elements", "every body")
 
     @property
+    def rounded(self) -> bool:
+        """Whether one of its parameters rounds a corner of its force."""
+        return any(spec.minor for spec in self.parameters)
+
+    @property
     def of_formula(self) -> bool:
         """Whether it is defined by its formula only."""
         return not self.listed and bool(self.formula)

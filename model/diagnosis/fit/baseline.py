@@ -130,12 +130,13 @@ def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     Levels of forces come before those of sensors: beside an overestimated force noise, sensors seem to have no noise
     of their own.
     """
-    settled, rules = 0, problem.rules.fit
+    settled, moved, rules = 0, np.inf, problem.rules.fit
     for _ in range(rules.renewals):
         before = problem.noise
         try:
             noise = force_noise(fit.forward, fit.spectrum, before, problem.rules.noise)
-            if np.all(np.abs(noise.force / before.force - 1) < rules.renewed):
+            # a level that vanishes goes on falling, without any effect
+            if np.all(np.abs(noise.force / before.force - 1) < rules.renewed) or moved < rules.numerical:
                 settled += 1
                 noise = sensor_noise(fit.forward, fit.spectrum, noise, problem.rules.noise)
         except np.linalg.LinAlgError:  # a fit whose responses are out of range keeps its levels
@@ -145,6 +146,7 @@ def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
         again = try_optimise(renewed, fit.point, 6 if enough else 2)
         if again is None:
             break
+        moved = abs(again.deviance - fit.deviance)
         problem, fit = renewed, again
         if enough:
             break

@@ -48,15 +48,13 @@ class Linearised:
     forward: Forward
     forces: LawForces | None
     shown: ComplexArray  # sensor signals without the free motion, (F, S)
-    free: ComplexArray  # motion per state at the first sample, (F, S, 2n)
     fine: bool = False  # whether the reaction of the laws is that on the oversampled axis
 
     @cached_property
     def spectrum(self) -> ComplexArray:
         """The residual itself, (F, S)."""
-        sensors = self.problem.part.sensors
-        swinging = self.free.reshape(-1, len(self.point.state)) @ self.point.state
-        found: ComplexArray = sensors - self.shown - swinging.reshape(sensors.shape)
+        free = self.problem.free_motion(self.forward, self.point.state)
+        found: ComplexArray = self.problem.part.sensors - self.shown - free
         return found
 
     @cached_property
@@ -82,10 +80,10 @@ class Linearised:
     def may_be_finer(self) -> bool:
         """Whether the reaction of the laws is not that on the oversampled axis yet, and would be better there.
 
-        Friction that turns within a sample has no slope on either axis.
+        A rounded corner that a motion passes within a sample, as friction's, has no slope on either axis.
         """
         forces = None if self.problem.process_noise or self.forward.plant.floats else self.forces
-        return not self.fine and forces is not None and all(one.element_law.corner is None for one in forces.terms)
+        return not self.fine and forces is not None and not any(one.law.rounded for one in forces.terms)
 
     @property
     def jacobian(self) -> FloatArray:
@@ -107,9 +105,10 @@ class Linearised:
         problem, point, working = self.problem, self.point, self.working
         known = _of_theta(problem, self.forward, self.forces, working.whitener, self.motions, point)
         _add_terms(known, problem, point, working, self.forward, self.forces, self.shown, self.motions)
-        known.packed.add_free(len(known.log_det), self.free)
+        free = problem.free_columns(self.forward)
+        known.packed.add_free(len(known.log_det), free)
         if self.forces is not None:
-            whitener, states = working.whitener, self.free.shape[2]
+            whitener, states = working.whitener, free.shape[2]
             _add_laws_answers(known, problem, whitener, self.forward, self.forces, states, fine=self.fine)
         return known
 
@@ -158,7 +157,7 @@ def linearise(problem: Problem, point: Point, working: Working, *, fine: bool = 
     if problem.work is not None:
         problem.work.add(problem.part.grid.samples)
     shown, forward, forces = problem.predict(point, working.inputs, working.plant)
-    return Linearised(problem, point, working, forward, forces, shown, problem.free_columns(forward), fine)
+    return Linearised(problem, point, working, forward, forces, shown, fine)
 
 
 def _of_theta(
@@ -305,7 +304,7 @@ def _difference(
         other = problem.shown(other_forward, forces)
     else:
         other, other_forward, other_forces = problem.predict(elsewhere, working.inputs, forward.plant)
-    free = (problem.free_columns(other_forward) - problem.free_columns(forward)) @ point.state
+    free = problem.free_motion(other_forward, point.state) - problem.free_motion(forward, point.state)
     if not problem.process_noise:
         return Change((other - shown + free) / step)
     change = (problem.smoothed(other_forward, other) - problem.smoothed(forward, shown) + free) / step

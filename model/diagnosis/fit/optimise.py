@@ -20,7 +20,7 @@ from sprung.model.diagnosis.fit.memory import key_of
 from sprung.model.diagnosis.fit.posterior import normal_equations, with_priors
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import Working, along_measured_motion, opened
-from sprung.model.diagnosis.fit.steps import FitSearch, SearchState, state_at, stepped, with_optimal_start
+from sprung.model.diagnosis.fit.steps import FitSearch, state_at, stepped, with_optimal_start
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Noise
 from sprung.model.diagnosis.record.spectra import ComplexArray
@@ -54,6 +54,7 @@ class Fit:
     left: float  # decrease of the objective in the last step, or predicted for a rejected one
     iterations: int
     unsettled: float  # of its last decrease, beyond which a fit has not converged
+    refused: bool = False  # whether the last step was, so that `left` is the fall promised to the optimum
     bounded: bool = False  # whether a law's parameter is at a bound
 
     def place(self, index: int) -> slice:
@@ -167,7 +168,7 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
         search = stepped(problem, search, count, tolerance)
         if search.ended:
             break
-    return _finish(problem, search.state, search.left, count)
+    return _finish(problem, search, count)
 
 
 def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[Point, Working]:
@@ -183,8 +184,9 @@ def information(problem: Problem, fit: Fit) -> FloatArray:
     return with_priors(problem, fit.point, fit.jacobian.T @ fit.jacobian)
 
 
-def _finish(problem: Problem, state: SearchState, left: float, count: int) -> Fit:
-    """The fit at a state, with its uncertainty."""
+def _finish(problem: Problem, search: FitSearch, count: int) -> Fit:
+    """The fit where a search ended, with its uncertainty."""
+    state = search.state
     point, lin = state.point, state.lin
     P = len(point.theta)
     free = lin.jacobian.shape[1] - len(point.state)
@@ -208,8 +210,9 @@ def _finish(problem: Problem, state: SearchState, left: float, count: int) -> Fi
         forward=lin.forward,
         forces=lin.forces,
         motions=lin.motions,
-        left=left,
+        left=search.left,
         iterations=count,
         unsettled=problem.rules.fit.unsettled,
+        refused=search.failed,
         bounded=any(t.bounded for t in point.terms),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sprung.model.diagnosis.fit.jacobian import Linearised
@@ -43,31 +45,41 @@ def normal_equations(problem: Problem, lin: Linearised, point: Point) -> tuple[F
     return normal * scale * scale[:, None], scale
 
 
-def gauss_newton_step(
-    problem: Problem, lin: Linearised, point: Point, damping: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Gauss-Newton step, standard deviations of theta and term parameters, and the predicted decrease."""
+class DampedStep(NamedTuple):
+    """A Gauss-Newton step with Levenberg-Marquardt damping."""
+
+    step: FloatArray  # (X,)
+    sigma: FloatArray  # standard deviations of theta and term parameters, (P + p,)
+    promised: float  # predicted decrease of the objective by the step with least damping
+    promised_damped: float  # and by this one
+
+
+def gauss_newton_step(problem: Problem, lin: Linearised, point: Point, damping: float) -> DampedStep:
+    """The step of the normal equations, priors included; values at a bound that it would pass are held."""
     scaled, scale = normal_equations(problem, lin, point)
     gradient = lin.jacobian.T @ lin.residual
     gradient[: len(lin.log_det_slope)] -= lin.log_det_slope / 2
     away, sharp = prior_residual(problem, point)
     gradient[: len(sharp)] -= away * sharp
-    step, variance, promised = _solved(scaled, scale, gradient, damping)
-    held = at_active_bounds(point, step)
+    free = len(scaled) - len(point.state)
+    found = _solved(scaled, scale, gradient, damping, free)
+    held = at_active_bounds(point, found.step)
     if held.any():  # the step of the others at constant held values
         scaled[held], scaled[:, held], gradient[held] = 0.0, 0.0, 0.0
-        step, variance, promised = _solved(scaled, scale, gradient, damping)
-    free = len(scaled) - len(point.state)
-    return step, np.sqrt(np.maximum(variance, 1e-300))[:free], promised
+        found = _solved(scaled, scale, gradient, damping, free)
+    return found
 
 
-def _solved(
-    scaled: FloatArray, scale: FloatArray, gradient: FloatArray, damping: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Solution of the damped normal equations, its variances, and the predicted decrease with least damping."""
+def _solved(scaled: FloatArray, scale: FloatArray, gradient: FloatArray, damping: float, free: int) -> DampedStep:
+    """Solution of the damped normal equations, with the deviations of the first `free` values."""
     values, vectors = np.linalg.eigh(scaled)
     values = np.maximum(values, 0.0)
     turned = vectors.T @ (gradient * scale)
     damped = values + damping + 1e-13
-    step = scale * (vectors @ (turned / damped))
-    return step, scale**2 * (vectors**2 @ (1 / damped)), float(np.sum(turned**2 / (values + LEAST_DAMPING)))
+    variance = scale**2 * (vectors**2 @ (1 / damped))
+    return DampedStep(
+        scale * (vectors @ (turned / damped)),
+        np.sqrt(np.maximum(variance, 1e-300))[:free],
+        float(np.sum(turned**2 / (values + LEAST_DAMPING))),
+        float(np.sum((turned / damped) ** 2 * (2 * damped - values))),
+    )

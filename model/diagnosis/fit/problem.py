@@ -124,6 +124,10 @@ class Problem:
         """Spectra of the shown free motion per state at the first sample, (F, S, 2n)."""
         return forward.plant.free_transforms(forward.free_rows_at_start())
 
+    def free_motion(self, forward: Forward, state: FloatArray) -> ComplexArray:
+        """Spectra of the shown free motion of a state at the first sample, (F, S)."""
+        return forward.plant.free_transform(forward.free_rows_at_start(), state)
+
 
 def law_forces(
     forward: Forward, point: Point, inputs: SmoothedInputs | None = None, tolerance: float = TOLERANCE

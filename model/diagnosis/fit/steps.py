@@ -69,17 +69,18 @@ class FitSearch:
     damping: float = LEAST_DAMPING
     left: float = np.inf  # by which the objective fell last, or what a step that was not taken promised
     relaxation: StepRelaxation = StepRelaxation()
-    renewed: bool = False  # whether the present point's inputs were smoothed anew
+    renewed: float | None = None  # by how much the objective moved as the present point's inputs were smoothed anew
+    failed: bool = False  # whether a step from the present point was refused
     ended: bool = False
 
     def renewed_by(self, state: SearchState) -> FitSearch:
         """At the same point, under inputs smoothed anew."""
-        return replace(self, state=state, renewed=True)
+        return replace(self, state=state, renewed=abs(state.value - self.state.value))
 
     def accepted(self, proposed: SearchState) -> FitSearch:
         """A step further, with less damping."""
         left, damping = self.state.value - proposed.value, max(self.damping / 10, LEAST_DAMPING / 1e3)
-        return replace(self, state=proposed, renewed=False, left=left, damping=damping)
+        return replace(self, state=proposed, renewed=None, failed=False, left=left, damping=damping)
 
     def with_equivalents(self, problem: Problem) -> FitSearch:
         """With the laws' linear equivalents at the present values."""
@@ -94,34 +95,41 @@ class FitSearch:
         """At the same point with more damping; ended where there is no more."""
         damping = max(self.damping * 30, 100 * LEAST_DAMPING)
         ended = damping > _MOST_DAMPING
-        return replace(self, left=promised, relaxation=StepRelaxation(), damping=damping, ended=ended)
+        return replace(self, left=promised, relaxation=StepRelaxation(), damping=damping, failed=True, ended=ended)
 
 
 def stepped(problem: Problem, search: FitSearch, count: int, tolerance: float) -> FitSearch:
     """The search after its `count`-th step, which is accepted, refused, or taken again from the present point."""
     rules, state = problem.rules.fit, search.state
-    step, sigma, promised = gauss_newton_step(problem, state.lin, state.point, search.damping)
+    step, sigma, promised, promised_damped = gauss_newton_step(problem, state.lin, state.point, search.damping)
+    grain = _grain(problem, state)
+    if search.failed and promised_damped < rules.numerical * grain:  # longer ones do not keep what they promise
+        return replace(search, left=promised_damped, ended=True)
     if not problem.process_noise:  # whose sensitivities know what the smoother makes of the laws' forces
         search = replace(search, relaxation=search.relaxation.after(state.lin.jacobian @ step))
     step = search.relaxation.factor * step
     size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
-    grain = _grain(problem, state)
     proposed = _proposed(problem, state, step, promised)
     if proposed.value >= state.value and promised < rules.numerical * grain:
         return replace(search, left=promised, ended=True)
     rise = proposed.value - state.value
-    if 0 <= rise < rules.smoothing * state.chi_square and not (search.renewed or problem.process_noise):
+    if 0 <= rise < rules.smoothing * state.chi_square and search.renewed is None and not problem.process_noise:
         search = search.renewed_by(state_at(problem, state.point, proposed.working, fine=state.lin.fine))
         if proposed.value >= search.state.value:
             return replace(search, left=promised, relaxation=StepRelaxation())
     if proposed.value < search.state.value:
         search = search.accepted(proposed)
-        if size < tolerance or search.left < rules.done * grain * max(1.0, size):
+        if size < tolerance:  # what it fell besides, by inputs smoothed anew, is not left
+            return replace(search, left=min(search.left, promised), ended=True)
+        if search.left < rules.done * grain * max(1.0, size):
             return replace(search, ended=True)
         return search.with_equivalents(problem) if count in (2, 4) else search
+    if search.renewed is not None and promised < min(search.renewed, rules.told * grain):
+        return replace(search, left=0.0, ended=True)  # nothing that smoothing the inputs does not move as much
     if promised > _MUCH * search.state.chi_square and search.state.lin.may_be_finer:
         return search.finer(promised)
-    return search.refused(promised)
+    refused = search.refused(promised)
+    return replace(refused, ended=True) if size < tolerance else refused
 
 
 def _proposed(problem: Problem, state: SearchState, step: FloatArray, promised: float) -> SearchState:

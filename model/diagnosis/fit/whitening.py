@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -28,7 +29,13 @@ class Whitener:
 
     def log_det_slope(self, change: ComplexArray) -> float:
         """Derivative of `log_det` along a change (F, S, inputs) of the response to the inputs."""
-        return 2 * float(self.weight**2 @ np.real(np.einsum("fst,fti,fis->f", self.factor, change, self.smoother_gain)))
+        return 2 * float(np.real(np.dot(self._weighted_gain, change.ravel())))
+
+    @cached_property
+    def _weighted_gain(self) -> ComplexArray:
+        """Gain from residual to input noise, weighted by bin, in the order of a change's values, (F * S * inputs,)."""
+        gain = self.smoother_gain @ self.factor * self.weight[:, None, None] ** 2
+        return np.ascontiguousarray(gain.transpose(0, 2, 1)).ravel()
 
     @classmethod
     def of(cls, forward: Forward, noise: Noise) -> Whitener:

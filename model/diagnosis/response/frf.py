@@ -258,6 +258,13 @@ class Plant:
         found: ComplexArray = columns.reshape(len(decays), *modal.shape[1:])
         return found
 
+    def free_transform(self, rows: FloatArray, state: FloatArray) -> ComplexArray:
+        """Transforms of rows e^{A t} state over the samples: (m, 2n), (2n,) -> (F, m)."""
+        if self._free_modes is None:
+            return np.asarray(self.free_transforms(rows) @ state)
+        vectors, decays, inverse = self._free_modes
+        return np.asarray(decays @ ((inverse @ state)[:, None] * (rows @ vectors).T))
+
     def free_motion(self, rows: FloatArray, step: float, count: int) -> FloatArray:
         """rows e^{A t} at t = 0, step, ...: (m, 2n) -> (count, m, 2n), by doubling."""
         power = expm(self.structure.state_matrix() * step)

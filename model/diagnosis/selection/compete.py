@@ -33,6 +33,7 @@ from sprung.model.diagnosis.selection.starts import alike_starts, starts_of
 
 _STEPS = 6  # from a start along the measured motion
 _FINISHING = 10  # of a first fit that is finished
+_PROMISED = 3  # times what a refused step promised, the most that further ones bring
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Trial:
     evidence: float  # gain less what its parameters cost
     freedom: int  # parameters of the law and states it adds
     finished: bool = True
+    gained: float = np.inf  # evidence, by further iterations
     compared: bool = True  # False: the model without it diverges, and the gain is no more than a rank
 
     @property
@@ -160,14 +162,16 @@ def _initial_fits(problem: Problem, base: Fit, candidates: list[Candidate], know
 def _leading(problem: Problem, trials: list[Trial]) -> tuple[list[Trial], list[Trial]]:
     """The trials, best first, whose fits are to be finished, and the others.
 
-    Of fits that are far behind, the first few are finished if steps like their last one would bring them to the lead:
-    from some starts the first steps are too few for their evidence to tell, and later ones are shorter.
+    Of fits that are far behind, the first few are finished if steps like their last one would bring them to the lead,
+    or what a refused one promised: from some starts the first steps are too few for their evidence to tell, and later
+    ones are shorter.
     """
     rules, best, least = problem.rules.selection, trials[0].evidence, trials[0].fit.chi_square
     leading, behind = [], []
     for rank, trial in enumerate(trials):
         close = problem.process_noise or trial.evidence > best - max(rules.near, rules.near_share * abs(best))
-        falling = trial.fit.converged or trial.fit.chi_square - _FINISHING * trial.fit.left < least
+        reach = (_PROMISED if trial.fit.refused else _FINISHING) * trial.fit.left
+        falling = trial.fit.converged or trial.fit.chi_square - reach < least
         if (rank < rules.last and falling) or (rank < rules.finished and close):
             leading.append(trial)
         else:
@@ -181,24 +185,18 @@ def _converged_fits(problem: Problem, base: Fit, trials: list[Trial]) -> list[Tr
 
 
 def _with_unconverged_refitted(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
-    """Trials by evidence, after further iterations of unconverged fits that could still take the lead."""
-    exhausted: list[Fit] = []  # whose further iterations gained less than they are behind: later ones gain less still
+    """Trials by evidence, after further iterations of unconverged fits that could still take the lead.
+
+    Of a fit whose last iterations gained less than it is behind, later ones gain less still.
+    """
     for _ in range(problem.rules.selection.settling):
         best = trials[0].evidence
-        unsettled = [
-            t for t in trials if t.finished and not t.fit.converged and all(t.fit is not one for one in exhausted)
-        ]
+        unsettled = [t for t in trials if t.finished and not t.fit.converged and t.gained > max(0.0, best - t.evidence)]
         falling = [t for t in unsettled if t.evidence + t.fit.left / t.fit.grain > best]
         if not falling:
             break
         others = [t for t in trials if all(t is not one for one in falling)]
-        again = _converged_fits(problem, base, falling)
-        best = max(t.evidence for t in (*again, *others))
-        for old, new in zip(falling, again, strict=True):
-            gained = new.evidence - old.evidence
-            if gained <= max(0.0, best - new.evidence):
-                exhausted.append(new.fit)
-        trials = by_evidence(problem, base, [*again, *others])
+        trials = by_evidence(problem, base, [*_converged_fits(problem, base, falling), *others])
     return trials
 
 
@@ -281,7 +279,7 @@ def by_evidence(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]
     least = min((t.fit.reduced for t in trials), default=1.0)
     if least < rules.quiet and not problem.process_noise:
         again = [_trial(problem, base, t.candidate, t.fit, rules.quiet * least) for t in trials]
-        trials = [replace(new, finished=t.finished) for new, t in zip(again, trials, strict=True)]
+        trials = [replace(new, finished=t.finished, gained=t.gained) for new, t in zip(again, trials, strict=True)]
     if not problem.process_noise:
         gains = monotone_gains([t.gain for t in trials], [t.fit.chi_square for t in trials], rules)
         trials = [
@@ -300,10 +298,11 @@ def _converged_fit(problem: Problem, base: Fit, trial: Trial) -> Trial:
     if trial.fit.converged and not problem.process_noise:
         return trial
     finished = _try(problem, base, trial.candidate, trial.fit.point, _FINISHING) or trial
-    if not problem.process_noise or finished.fit.deviance > base.deviance:
-        return finished
-    _, fit = refreshed(problem, finished.fit)
-    return _trial(problem, base, trial.candidate, fit)
+    if problem.process_noise and finished.fit.deviance <= base.deviance:
+        _, fit = refreshed(problem, finished.fit)
+        finished = _trial(problem, base, trial.candidate, fit)
+    before = _trial(problem, base, trial.candidate, trial.fit)  # its evidence may know a lower noise level
+    return replace(finished, gained=finished.evidence - before.evidence)
 
 
 def _trial(problem: Problem, base: Fit, candidate: Candidate, fit: Fit, quiet: float | None = None) -> Trial:

@@ -19,6 +19,7 @@ class FallingFit:
 
     left: float
     converged: bool = False
+    refused: bool = False
     grain: float = 1.0
     reduced: float = 1.0
     chi_square: float = 1.0
@@ -39,7 +40,7 @@ def test_what_could_lead_is_fitted_on_while_it_gets_further(
     def fitted_on(problem: Any, base: Any, one: Trial) -> Trial:
         tried.append(one)
         fit: Any = FallingFit(one.fit.left)
-        return replace(one, fit=fit, evidence=one.evidence + step)
+        return replace(one, fit=fit, evidence=one.evidence + step, gained=step)
 
     monkeypatch.setattr(compete, "_converged_fit", fitted_on)
     problem: Any = SimpleNamespace(work=None, process_noise=True, rules=RULES)
