@@ -132,3 +132,15 @@ def test_a_long_step_of_a_law_keeps_its_direction() -> None:
     ]
     assert changes[1][1] == pytest.approx(-1.0)
     np.testing.assert_allclose(np.array(changes[1]) / changes[1][1], np.array(changes[0]) / changes[0][1])
+
+
+def test_a_fit_that_goes_on_from_an_optimum_ends_at_once_as_converged() -> None:
+    """Steps promise what smoothing the inputs anew takes back; from raw inputs the first one falls by that much."""
+    system = quarter_car()
+    signals = prepare(system, simulate(friction, seconds=12, seed=3).values, 100.0).signals
+    problem, base = baseline(system, signals, declared_noise(system, signals), 1000)
+    term = Term(find_law("coulomb_friction"), "secondary", (400.0, 5e-3), scales=(400.0, 5e-3))
+    fit = optimise(problem, Point(base.point.theta, (term,), base.point.state))
+    again = optimise(problem, fit.point)
+    assert again.converged and again.iterations <= 3
+    assert again.chi_square == pytest.approx(fit.chi_square, abs=1.0)
