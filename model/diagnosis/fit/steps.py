@@ -104,7 +104,7 @@ def stepped(problem: Problem, search: FitSearch, count: int, tolerance: float) -
     step, sigma, promised, promised_damped = gauss_newton_step(problem, state.lin, state.point, search.damping)
     grain = _grain(problem, state)
     if search.failed and promised_damped < rules.numerical * grain:  # longer ones do not keep what they promise
-        return replace(search, left=promised_damped, ended=True)
+        return replace(search, left=promised if promised > rules.told * grain else promised_damped, ended=True)
     if not problem.process_noise:  # whose sensitivities know what the smoother makes of the laws' forces
         search = replace(search, relaxation=search.relaxation.after(state.lin.jacobian @ step))
     step = search.relaxation.factor * step
