@@ -267,63 +267,30 @@ def _gmres(
         return right, 0
     basis = np.empty((columns, krylov + 1, flat.shape[1]), right.dtype)
     basis[:, 0] = flat / np.where(used, size, 1.0)[:, None]
-    projected = _ProjectedSystem(size, krylov)
+    hessenberg = np.zeros((columns, krylov + 1, krylov), right.dtype)
+    target = np.zeros((columns, krylov + 1, 1), right.dtype)
+    target[:, 0, 0] = size
     for k in range(krylov):
         w = apply(basis[:, k].reshape(right.shape)).reshape(flat.shape)
         known, length = basis[:, : k + 1], np.linalg.norm(w, axis=1)
-        shares = np.zeros((columns, k + 2))
         for _ in range(2):  # the second time where much was taken away (Daniel et al. 1976)
             before = length
             along = known @ w[:, :, None]
             w = w - (along.transpose(0, 2, 1) @ known)[:, 0]
-            shares[:, : k + 1] += along[:, :, 0]
+            hessenberg[:, : k + 1, k] += along[:, :, 0]
             length = np.linalg.norm(w, axis=1)
             if np.all(length[used] > _CANCELLED * before[used]):
                 break
         if not np.isfinite(length).all():
             return np.full_like(right, np.nan), k + 1
-        shares[:, k + 1] = length
-        projected.add(shares)
-        if np.max(projected.left[used] / size[used]) < _KRYLOV_TOLERANCE:
+        hessenberg[:, k + 1, k] = length
+        solved = np.linalg.pinv(hessenberg[:, : k + 2, : k + 1]) @ target[:, : k + 2]
+        left = target[:, : k + 2] - hessenberg[:, : k + 2, : k + 1] @ solved
+        if np.max(np.linalg.norm(left[:, :, 0], axis=1)[used] / size[used]) < _KRYLOV_TOLERANCE:
             break
         basis[:, k + 1] = w / np.where(length > 1e-12, length, 1.0)[:, None]
-    solved = projected.solution().astype(right.dtype)
-    found = solved[:, None] @ basis[:, : solved.shape[1]]
+    found = solved.transpose(0, 2, 1) @ basis[:, : solved.shape[1]]
     return np.asarray(found.reshape(right.shape)), k + 1
-
-
-class _ProjectedSystem:
-    """The least-squares problems of GMRES in its Krylov space, one a column, as triangular ones by Givens rotations."""
-
-    def __init__(self, size: FloatArray, krylov: int) -> None:
-        self.triangle = np.zeros((len(size), krylov, krylov))
-        self.turns = np.zeros((krylov, 2, len(size)))  # cosine and sine
-        self.right = np.zeros((len(size), krylov + 1))
-        self.right[:, 0] = size
-        self.count = 0
-
-    def add(self, shares: FloatArray) -> None:
-        """One more basis vector: shares (columns, k + 2) of its image along all vectors and the next."""
-        k = self.count
-        for j, (c, s) in enumerate(self.turns[:k]):
-            upper, lower = shares[:, j].copy(), shares[:, j + 1].copy()
-            shares[:, j], shares[:, j + 1] = c * upper + s * lower, c * lower - s * upper
-        size = np.hypot(shares[:, k], shares[:, k + 1])
-        size[size == 0] = 1.0  # of a column without any right-hand side
-        c, s = self.turns[k] = shares[:, k] / size, shares[:, k + 1] / size
-        self.triangle[:, :k, k], self.triangle[:, k, k] = shares[:, :k], size
-        self.right[:, k], self.right[:, k + 1] = c * self.right[:, k], -s * self.right[:, k]
-        self.count += 1
-
-    @property
-    def left(self) -> FloatArray:
-        """Norms of the residuals, (columns,)."""
-        return np.abs(self.right[:, self.count])
-
-    def solution(self) -> FloatArray:
-        """Coefficients of the basis vectors, (columns, count)."""
-        k = self.count
-        return np.asarray(np.linalg.solve(self.triangle[:, :k, :k], self.right[:, :k, None])[:, :, 0])
 
 
 def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
