@@ -41,7 +41,7 @@ def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple
     These are the laws of almost the same evidence.  If the model leaves more than noise it is not exact, and evidence
     ranks approximations, not truths: laws that leave hardly more error are then included.
     """
-    task = final.task.every(max(1, len(final.task.force) // final.task.rules.search))
+    task = final.task.thinned(final.task.rules.search)
     here, found = refined(task, final.model), []
     for index, step in enumerate(steps, first):
         valve = low_valve(here, index)

@@ -27,7 +27,7 @@ def possible_drift(found: Search, given: ComponentModel) -> ZeroDrift | None:
     if found.base.at_noise:
         return None
     laws = range(len(given.pieces), len(fit.model.pieces))
-    quick = fit.task.every(max(1, len(fit.task.force) // rules.search))
+    quick = fit.task.thinned(rules.search)
     best, least = None, np.inf
     for model in (given, fit.model, *(fit.model.without(index) for index in laws)):
         before = fitted(quick, model)

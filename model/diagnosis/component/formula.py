@@ -113,7 +113,7 @@ def formula_search(task: ComponentTask, given: ComponentModel) -> Search | None:
     Pairs are made of the best single shapes.
     """
     rules = task.rules
-    quick, fine = task.every(max(1, len(task.force) // rules.search)), task.every(max(1, len(task.force) // rules.fit))
+    quick, fine = task.thinned(rules.search), task.thinned(rules.fit)
     base, seen = refined(quick, given), _observed(task)
     single = {piece.key: (form, piece) for form in forms() for piece in [_single(form, seen)]}
     alone = [

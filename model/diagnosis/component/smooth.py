@@ -68,7 +68,7 @@ def smooth_serves(fit: ComponentFit, first: int) -> bool:
     bent = [piece for i in curves if isinstance(piece := model.pieces[i], Piece) and piece.shapes]
     if not bent or (len(curves) < 2 and not bent[0].imitates):
         return False
-    quick = fit.task.every(max(1, len(fit.task.force) // rules.search))
+    quick = fit.task.thinned(rules.search)
     laws, rest = refined(quick, model), model
     for index in reversed(curves):
         rest = rest.without(index)

@@ -91,6 +91,10 @@ class ComponentTask:
             self, motion=self.motion.every(stride), force=self.force[::stride], split=-(-self.split // stride)
         )
 
+    def thinned(self, samples: int) -> ComponentTask:
+        """The same thinned out evenly, to `samples` or up to twice as many."""
+        return self.every(max(1, len(self.force) // samples))
+
     @cached_property
     def linear(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Columns (T, m) of preload, k and c that are free, a mask of these (3,), and the force less the fixed ones."""

@@ -52,8 +52,8 @@ def search(
     rules = task.rules
     tests = rules.trials_of_a_law * len(pieces)
     pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)), *lags)
-    quick = task.every(max(1, len(task.force) // rules.search))
-    fine = task.every(max(1, len(task.force) // rules.fit))
+    quick = task.thinned(rules.search)
+    fine = task.thinned(rules.fit)
     base = refined(quick, given)
     grown = _grown(base, pieces, tests, progress)
     composite = {piece.key for piece in grown.current.fit.model.pieces[len(given.pieces) :] if piece.commoner > 0}
