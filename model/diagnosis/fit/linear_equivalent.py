@@ -34,9 +34,8 @@ def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | No
     """
     if not any(_carried(term) for term in point.terms):
         return point
-    plant = None
+    forward = problem.forward(point, inputs)
     for _ in range(_ROUNDS):
-        forward = problem.forward(point, inputs, plant)
         forces = law_forces(forward, point, inputs, _ROUGH)
         if forces is None:
             return point
@@ -46,11 +45,10 @@ def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | No
         if change < _SETTLED or problem.process_noise:
             break
         # the particular solution of the plant has changed: the free state is shifted so that the total state stays
-        moved = problem.forward(point, inputs)
-        plant = moved.plant
-        balance = moved.harmonic_balance(point.state)
+        forward = problem.forward(point, inputs)
+        balance = forward.harmonic_balance(point.state)
         if balance is not None:
-            point = replace(point, state=start + point.state - particular_start(moved, balance.solution(force)))
+            point = replace(point, state=start + point.state - particular_start(forward, balance.solution(force)))
         if forces.converged and change < _NEAR:
             break
     return point

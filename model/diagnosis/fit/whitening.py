@@ -35,7 +35,7 @@ class Whitener:
     def _weighted_gain(self) -> ComplexArray:
         """Gain from residual to input noise, weighted by bin, in the order of a change's values, (F * S * inputs,)."""
         gain = self.smoother_gain @ self.factor * self.weight[:, None, None] ** 2
-        return np.ascontiguousarray(gain.transpose(0, 2, 1)).ravel()
+        return np.asarray(gain.transpose(0, 2, 1).ravel())
 
     @classmethod
     def of(cls, forward: Forward, noise: Noise) -> Whitener:
