@@ -127,15 +127,14 @@ def _tokens(path: Path, found: Backup, keep: bool) -> list[TokenRow]:
     store = open_store(f"sqlite:///{path}")
     try:
         every = Tokens(store)
-        kept = [row for row in every.rows() if row.revoked_ns is None]
-        gone = [] if keep else every.revoke_all("restoration")
+        good = [r for r in every.rows() if r.revoked_ns is None] if keep else every.revoke_all("restoration")
         with store.write() as connection:
             detail = {"of": found.created, "tokens": "kept" if keep else "revoked"}
             audit.record(connection, "local", "restore", STORE, detail, now_ns())
     finally:
         store.close()
     _one_file(path)
-    return kept if keep else gone
+    return good
 
 
 def _one_file(path: Path) -> None:

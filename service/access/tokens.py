@@ -139,18 +139,15 @@ class Tokens:
         """Make a token worthless.  Raises NotFound."""
         now = self._clock()
         with self._store.write() as connection:
-            if not tokens.revoke(connection, token_id, now):
+            if not _revoked(connection, token_id, now, by):
                 raise NotFound(f"no token {token_id[:40]!r} that is not revoked")
-            audit.record(connection, by, "revoke token", token_id, None, now)
         self._forget()
 
     def revoke_all(self, by: str = "local") -> list[TokenRow]:
         """Make every token worthless; those that were not revoked before, the newest first."""
         now = self._clock()
         with self._store.write() as connection:
-            revoked = [row for row in tokens.list_all(connection) if tokens.revoke(connection, row.id, now)]
-            for row in revoked:
-                audit.record(connection, by, "revoke token", row.id, None, now)
+            revoked = [row for row in tokens.list_all(connection) if _revoked(connection, row.id, now, by)]
         self._forget()
         return revoked
 
@@ -236,6 +233,14 @@ class Tokens:
         with self._lock:
             self._known.clear()
         self._counted = (-1e9, False)
+
+
+def _revoked(connection: Connection, token_id: str, now: int, by: str) -> bool:
+    """Whether a token was not revoked before; it is now, and that is in the audit log."""
+    found = tokens.revoke(connection, token_id, now)
+    if found:
+        audit.record(connection, by, "revoke token", token_id, None, now)
+    return found
 
 
 def _worthless(row: TokenRow, now: int) -> str | None:
