@@ -41,7 +41,10 @@ DELAY_STD = 0.002  # s: filters, scheduling and clocks of nodes
 AXLE_STD = 0.03  # of an axle's mass that the file states without a deviation: wheels wear, and new ones are put on
 LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations
 USUAL_SPEED = 30.0  # m/s, taken for curves where only the yaw rate is measured
-COLDEST, HOTTEST = -70.0, 150.0  # degC; beyond, a probe is broken, and the temperature unknown
+POSSIBLE = {  # values of operating conditions where the file states no range; beyond, a probe is broken
+    "temperature": (-70.0, 150.0),  # degC
+    "speed": (-200.0, 200.0),  # m/s; the record of trains is 168, and an odometer may count backwards
+}
 ALONG = ("displacement", "velocity")  # quantities of a support that say where it is, as laws need
 _HELD = 1e-3  # Hz, a slower mode is one that nothing holds, but for rounding
 SHORTEST_TRACK = 10.0  # s, of a window of a vehicle with unmeasured wheels
@@ -49,7 +52,8 @@ SHORTEST_TRACK = 10.0  # s, of a window of a vehicle with unmeasured wheels
 
 def _channel(name: str, quantity: str, at: Address) -> Channel:
     gain, offset = at.conversion(SI[quantity])
-    return Channel(name, SI[quantity], at.noise, at.mcap, at.can, at.csv, at.column, gain, offset, at.range)
+    possible = at.range or POSSIBLE.get(quantity)
+    return Channel(name, SI[quantity], at.noise, at.mcap, at.can, at.csv, at.column, gain, offset, possible)
 
 
 def _signal_channel(name: str, at: FollowedSignal) -> Channel:
@@ -181,9 +185,13 @@ class System:
         return tuple(channels)
 
     def conditions(self, auxiliary: FloatArray | None) -> Conditions:
-        """How the vehicle ran during a window, from its auxiliary values (A,)."""
-        names = [channel.name for channel in self.auxiliary]
-        values = dict(zip(names, [] if auxiliary is None else auxiliary.tolist(), strict=False))
+        """How the vehicle ran during a window, from its auxiliary values (A,); impossible ones are unknown."""
+        measured = [] if auxiliary is None else auxiliary.tolist()
+        values = {
+            channel.name: value
+            for channel, value in zip(self.auxiliary, measured, strict=False)
+            if channel.range is None or channel.range[0] <= value <= channel.range[1]
+        }
         speed = values.get("speed", math.nan)
         if self.file.speed is not None and self.file.speed.value is not None:
             speed = self.file.speed.value
@@ -192,10 +200,7 @@ class System:
         if not math.isfinite(lateral):
             lateral = usual * values.get("yaw_rate", math.nan)
         pressure = tuple(values.get(f"{load.body}.pressure", math.nan) for load in self.loads)
-        temperature = values.get("temperature", math.nan)
-        if not COLDEST < temperature < HOTTEST:
-            temperature = math.nan
-        return Conditions(speed, temperature, lateral, pressure)
+        return Conditions(speed, values.get("temperature", math.nan), lateral, pressure)
 
     @cached_property
     def signals(self) -> tuple[Channel, ...]:

@@ -48,6 +48,11 @@ ZERO_APART = 6.0  # usual steps from one sample to the next by which both neighb
 STANDS_OUT = 10.0  # median deviations of the other values by which a sentinel must then lie outside them
 
 
+def plausible_range(channel: Channel) -> tuple[float, float]:
+    """Lowest and highest value, in the channel's unit, that is taken for a measured one."""
+    return channel.range or RANGES.get(channel.unit, ANYTHING)
+
+
 def nanoseconds(seconds: FloatArray) -> tuple[IntArray, BoolArray]:
     """Times (T,) in s as ns, and which of them are times at all; the others are 0."""
     with np.errstate(invalid="ignore", over="ignore"):
@@ -66,7 +71,7 @@ class PlausibilityCheck:
         self._channels = channels
         self._account = account
         self._convert = convert
-        limits = np.array([channel.range or RANGES.get(channel.unit, ANYTHING) for channel in channels])
+        limits = np.array([plausible_range(channel) for channel in channels])
         self._low, self._high = limits.reshape(-1, 2).T
         self._ambiguous = np.array([channel.unit in AMBIGUOUS or channel.gain != 1.0 for channel in channels])
         self._bad = np.zeros(len(channels), dtype=np.int64)  # values taken as missing

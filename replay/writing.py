@@ -46,6 +46,12 @@ def write_recording(
     writer(path, channels, recorded, times, dbc, vehicle)
 
 
+def without_address(path: Path, channel: Channel) -> str | None:
+    """The kind of address that a channel lacks to be written into a file of this kind; None where it has all."""
+    key = {".csv": None, ".mcap": "mcap"}.get(path.suffix.lower(), "can")
+    return None if key is None or getattr(channel, key) is not None else key
+
+
 def _csv(
     path: Path, channels: Sequence[Channel], values: FloatArray, times: np.ndarray, dbc: object, vehicle: str | None
 ) -> None:

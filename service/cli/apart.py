@@ -12,7 +12,15 @@ from sprung.replay.record import Record
 from sprung.service.errors import UserError
 from sprung.service.processes.worker import ProcessLimits, Task, carried_out
 from sprung.service.settings import Settings, settings_with
-from sprung.service.sources.loading import InspectionRequest, RecordRequest, inspect_task, load_task
+from sprung.service.sources.loading import (
+    DrivingRecord,
+    DrivingRequest,
+    InspectionRequest,
+    RecordRequest,
+    driving_task,
+    inspect_task,
+    load_task,
+)
 from sprung.service.sources.reading import SLOWEST_BYTES_PER_SECOND, Reading, ReadRequest, ReadWindows, reading_of
 
 Request = TypeVar("Request")
@@ -44,6 +52,11 @@ def readable(path: Path) -> None:
 def load(request: RecordRequest) -> Record:
     """The record.  Raises UnreadableRecording, or UserError where the bounds are exceeded."""
     return _apart(load_task, request, request.path)
+
+
+def load_driving(request: DrivingRequest) -> DrivingRecord:
+    """The record, and what was measured beside its inputs.  Raises as `load`."""
+    return _apart(driving_task, request, request.record.path)
 
 
 def look(request: InspectionRequest) -> Inspection:

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from sprung.model.laws import CATALOGUE, Law
+from sprung.model.signals import Channel
 from sprung.model.simulate.ride import simulate_ride
-from sprung.model.system import MANCHESTER, load_system
-from sprung.model.text import counted, some
+from sprung.model.system import MANCHESTER, System, load_system
+from sprung.model.text import counted
+from sprung.replay.plausibility import plausible_range
 from sprung.replay.record import Record
-from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
+from sprung.replay.writing import WRITERS, UnwritableRecording, without_address, write_recording
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.targets import check_file, check_folder
 from sprung.service.errors import UserError
 from sprung.service.report.recordings import SYSTEM_FILES, Comparison, compare
-from sprung.service.sources.loading import RecordRequest
+from sprung.service.sources.loading import DrivingRecord, DrivingRequest, RecordRequest
 
 
 def simulate(
@@ -40,24 +43,82 @@ def simulate(
     check_file(out)
     system = load_system(system_file, catalogue)
     database = database_of(system, dbc)
-    record = apart.load(RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, None))
+    changed, circumstances = _settings(system, settings)
+    request = RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, None)
+    drive = apart.load_driving(DrivingRequest(request, system.auxiliary))
+    record = drive.record
     driven = record.values[:, : len(system.inputs)]
-    ride = simulate_ride(
-        system, driven, dict(map(_setting, settings)), noise=np.random.default_rng(seed) if noise else None
-    )
-    values = np.concatenate([driven, ride.sensors], axis=1)
-    write_recording(
-        out, system.channels, values, system.sample_rate, record.start, dbc=database, vehicle=record.vehicle
-    )
+    ride = simulate_ride(system, driven, changed, noise=np.random.default_rng(seed) if noise else None)
+    beside, missing = _circumstances(system, drive, circumstances, out)
+    values = np.concatenate([driven, ride.sensors, drive.beside[:, beside]], axis=1)
+    channels = (*system.channels, *(system.auxiliary[index] for index in beside))
+    if out.suffix.lower() not in (".csv", ".mcap"):
+        _check_frames(channels, [channel for channel in system.auxiliary if channel not in channels])
+    write_recording(out, channels, values, system.sample_rate, record.start, dbc=database, vehicle=record.vehicle)
     laws = ", ".join(f"{law.law.name} at {law.location}" for law in system.laws) or "none"
     print(
-        f"{out}: {counted(len(values), 'sample')} of {counted(len(system.channels), 'channel')}; laws: {laws}",
+        f"{out}: {counted(len(values), 'sample')} of {counted(len(channels), 'channel')}; laws: {laws}",
         file=sys.stderr,
     )
-    if system.auxiliary:
-        names = some([channel.name for channel in system.auxiliary], 5)
-        print(f"sprung: {out}: holds inputs and sensors alone, not {names}", file=sys.stderr)
+    if missing:
+        print(f"sprung: {out}: is without {'; '.join(missing)}", file=sys.stderr)
     return 0
+
+
+def _settings(system: System, texts: list[str]) -> tuple[dict[str, float], dict[str, float]]:
+    """Values of the vehicle that are changed, and those of speed, temperature and the like, by name."""
+    known = {channel.name: channel for channel in system.auxiliary}
+    vehicle: dict[str, float] = {}
+    beside: dict[str, float] = {}
+    for name, value in map(_setting, texts):
+        if name in vehicle or name in beside:
+            raise UserError(f"--set {name}: is given twice")
+        if name not in known:
+            vehicle[name] = value
+            continue
+        lowest, highest = plausible_range(known[name])
+        if not lowest <= value <= highest:  # True for NaN
+            limits = f"from {lowest:g} to {highest:g} {known[name].unit}"
+            raise UserError(f"--set {name}={value:g}: {name} lies {limits}; another `range` is for the system file")
+        beside[name] = value
+    return vehicle, beside
+
+
+def _circumstances(
+    system: System, drive: DrivingRecord, given: dict[str, float], out: Path
+) -> tuple[list[int], list[str]]:
+    """Which of the auxiliary channels are written, and a phrase for each of the others.
+
+    They are as they were given, else as in the ride; a pressure goes with the load, which is another one here.
+    """
+    written, missing = [], []
+    for index, channel in enumerate(system.auxiliary):
+        if channel.name in given:
+            drive.beside[:, index] = given[channel.name]
+        if (key := without_address(out, channel)) is not None:
+            missing.append(f"{channel.name}, which has no `{key}` address in the system file")
+        elif channel.name not in given and channel.unit == "Pa":
+            missing.append(f"{channel.name}, which depends on the load: give it by --set {channel.name}=NUMBER")
+        elif not np.isfinite(drive.beside[:, index]).all():
+            missing.append(f"{channel.name}, which is not in the recording: give it by --set {channel.name}=NUMBER")
+        else:
+            written.append(index)
+    return written, missing
+
+
+def _check_frames(written: Sequence[Channel], left_out: Sequence[Channel]) -> None:
+    """A frame has a number for each of its signals: what shares one cannot be left out.  Errors: `UserError`."""
+    frames = {_frame(channel): channel.name for channel in written}
+    for channel in left_out:
+        if (beside := frames.get(_frame(channel))) is not None and channel.can is not None:
+            raise UserError(
+                f"{channel.name} would be written as 0, in one CAN message with {beside}: "
+                f"give it by --set {channel.name}=NUMBER, or write .mcap"
+            )
+
+
+def _frame(channel: Channel) -> str:
+    return "" if channel.can is None else channel.can.rpartition(".")[0]
 
 
 def _setting(text: str) -> tuple[str, float]:

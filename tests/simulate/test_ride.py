@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,10 @@ from sprung.model.laws import CLOCK_LEAD
 from sprung.model.simulate.begun import fitted_start
 from sprung.model.simulate.ride import SimulationError, simulate_ride, with_values
 from sprung.model.system import System, load_system, parse_system
+from sprung.replay.auxiliary import AuxiliaryMeans
 from sprung.replay.record import load_record
+from sprung.replay.recording import open_recording
+from sprung.replay.windowing import Windower
 from sprung.replay.writing import UnwritableRecording, write_recording
 from sprung.service.cli import main
 
@@ -201,17 +206,123 @@ def test_simulate_then_compare_on_the_command_line(tmp_path: Path, capsys: pytes
     assert json.loads(capsys.readouterr().out)["nrmse"] == 0
 
 
-def test_signals_that_a_simulated_recording_lacks_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "car.yaml"
-    file.write_text(
-        "name: car\nsample_rate: 100\nwindow: 100\nspeed: {csv: v}\ntemperature: {csv: T}\nbodies:\n"
-        "  body: {mass: 400}\ninputs:\n  road: {kind: support, displacement: {csv: z}, velocity: {csv: w}}\n"
-        "elements:\n  strut: {upper: body, lower: road, stiffness: 2.0e+4, damping: 1500}\n"
-        "sensors:\n  top: {kind: acceleration, body: body, csv: a}\n"
-    )
-    rows = [f"{i / 100:.2f},{np.sin(i / 9):.6f},{11.1 * np.cos(i / 9):.6f},0,20,18" for i in range(600)]
-    (tmp_path / "in.csv").write_text("time,z,w,a,v,T\n" + "\n".join(rows) + "\n")
-    made = tmp_path / "out.csv"
-    assert main(["simulate", str(file), "--inputs", str(tmp_path / "in.csv"), "--out", str(made)]) == 0
-    assert "holds inputs and sensors alone, not speed, temperature" in capsys.readouterr().err
-    assert made.read_text().splitlines()[0] == "time,z,w,a"
+CAR = """
+name: car
+sample_rate: 100
+window: 100
+speed: {csv: v, mcap: /gps.speed, unit: km/h}
+temperature: {csv: T}
+bodies:
+  body: {mass: 400, load: {max: 200, pressure: {csv: p, mcap: /air.p}}}
+  axle: {mass: 45}
+inputs:
+  road: {kind: support, displacement: {csv: z, mcap: /road.z}, velocity: {csv: w, mcap: /road.w}}
+elements:
+  strut: {upper: body, lower: axle, stiffness: 2.0e+4, damping: 1500}
+  tyre: {upper: axle, lower: road, stiffness: 2.0e+5, damping: 100}
+sensors:
+  top: {kind: acceleration, body: body, csv: a, mcap: /body.a}
+  hub: {kind: acceleration, body: axle, csv: h, mcap: /axle.a}
+"""
+
+
+@pytest.fixture
+def ride(tmp_path: Path) -> Path:
+    """Speed once a second, rising by 1 km/h, temperature once; in the middle of the first second for the first time."""
+    (tmp_path / "car.yaml").write_text(CAR)
+    rows = []
+    for i in range(600):
+        beside = (f"{i // 100 + 36}" if i % 100 == 50 else "") + "," + ("18" if i == 250 else "")
+        rows.append(f"{i / 100:.2f},{np.sin(i / 9):.6f},{11.1 * np.cos(i / 9):.6f},0,0,{beside},4e5")
+    (tmp_path / "in.csv").write_text("time,z,w,a,h,v,T,p\n" + "\n".join(rows) + "\n")
+    return tmp_path / "in.csv"
+
+
+def simulated(ride: Path, out: str, *options: str) -> list[dict[str, str]]:
+    made = ride.with_name(out)
+    told = ["simulate", str(ride.with_name("car.yaml")), "--inputs", str(ride), "--out", str(made), *options]
+    assert main(told) == 0
+    return list(csv.DictReader(made.read_text().splitlines())) if made.suffix == ".csv" else []
+
+
+def test_speed_and_temperature_of_the_ride_are_those_of_the_simulated_one(
+    ride: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = simulated(ride, "out.csv")
+    assert {float(row["T"]) for row in rows} == {18.0}
+    speed = [float(row["v"]) for row in rows]
+    assert speed == pytest.approx(np.interp(np.arange(600) / 100, np.arange(6) + 0.5, np.arange(6) + 36.0))
+    told = capsys.readouterr().err
+    assert "p" not in rows[0] and "is without body.pressure, which depends on the load: give it by --set" in told
+    system = load_system(ride.with_name("car.yaml"))
+    windows, beside = Windower(system.channels, 100.0, 100), AuxiliaryMeans(len(system.channels), 3)
+    recording = open_recording(ride.with_name("out.csv"), system.channels, beside=system.auxiliary)
+    read = [w for block in recording.at_rate(100.0, beside.keep) for w in windows.push(block)]
+    conditions = system.conditions(beside.to(read[3]).auxiliary)  # as the monitor reads it
+    assert conditions.temperature == 18.0 and 36 / 3.6 < conditions.speed < 42 / 3.6
+
+
+def test_what_a_simulated_recording_lacks_is_named_and_can_be_given(
+    ride: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ride.write_text("\n".join(",".join(line.split(",")[:5]) for line in ride.read_text().splitlines()) + "\n")
+    rows = simulated(ride, "out.csv", "--set", "temperature=-5", "--set", "body.pressure=450000")
+    assert {row["T"] for row in rows} == {"-5"} and {row["p"] for row in rows} == {"450000"}
+    assert "is without speed, which is not in the recording: give it by --set speed=NUMBER" in capsys.readouterr().err
+    simulated(ride, "out.mcap", "--set", "speed=10", "--set", "temperature=-5")
+    assert "temperature, which has no `mcap` address in the system file; body.pressure" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("temperature=nan", "temperature lies from -70 to 150 degC"),
+        ("temperature=inf", "temperature lies from -70 to 150 degC"),
+        ("temperature=-5000", "temperature lies from -70 to 150 degC"),
+        ("temperature=151", "temperature lies from -70 to 150 degC"),
+        ("speed=300", "speed lies from -200 to 200 m/s"),
+        ("body.pressure=1e12", "body.pressure lies from -1e+09 to 1e+09 Pa"),
+        ("temperature=5,temperature=6", "temperature: is given twice"),
+        ("body.mass=300,body.mass=400", "body.mass: is given twice"),
+    ],
+)
+def test_conditions_that_no_vehicle_meets_are_refused(
+    setting: str, told: str, ride: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = ride.with_name("out.csv")
+    command = ["simulate", str(ride.with_name("car.yaml")), "--inputs", str(ride), "--out", str(made)]
+    for one in setting.split(","):
+        command += ["--set", one]
+    assert main(command) == 2 and not made.exists()
+    error = capsys.readouterr().err
+    assert told in error and error.count("\n") == 1
+
+
+def test_a_condition_that_the_ride_cannot_have_had_is_unknown_and_told(
+    ride: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A broken probe of the ride is not simulated; the monitor ignores it, too, and says so."""
+    ride.write_text(ride.read_text().replace(",18,4e5", ",-3000,4e5"))
+    assert "T" not in simulated(ride, "out.csv")[0]
+    assert "is without temperature, which is not in the recording" in capsys.readouterr().err
+    system = load_system(ride.with_name("car.yaml"))
+    recording = open_recording(ride, system.channels, beside=system.auxiliary)
+    for _ in recording.blocks():
+        pass
+    assert any("temperature: 1 of its values taken as missing" in problem for problem in recording.problems)
+    unknown = system.conditions(np.array([250.0, -80.0, 4e5]))
+    assert np.isnan(unknown.speed) and np.isnan(unknown.temperature)
+
+
+def test_what_shares_a_can_message_is_not_written_as_zero(ride: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    car, fields = ride.with_name("car.yaml"), iter(["p", "z", "w", "a", "h"])
+    text = CAR.replace("speed: {csv: v, mcap: /gps.speed, unit: km/h}\ntemperature: {csv: T}\n", "")
+    car.write_text(re.sub(r"mcap: [^},]+", lambda _: f"can: Car.{next(fields)}", text))
+    signals = "".join(f' SG_ {name} : {16 * i}|16@1- (0.001,0) [0|0] "" X\n' for i, name in enumerate("zwah"))
+    pressure = ' SG_ p : 64|32@1+ (1,0) [0|0] "Pa" X\n'
+    ride.with_name("car.dbc").write_text(f'VERSION ""\nBU_: X\nBO_ 1 Car: 64 X\n{signals}{pressure}')
+    command = ["simulate", str(car), "--inputs", str(ride), "--out", str(ride.with_name("out.blf"))]
+    command += ["--dbc", str(ride.with_name("car.dbc"))]
+    assert main(command) == 2 and not ride.with_name("out.blf").exists()
+    assert "body.pressure would be written as 0, in one CAN message with" in capsys.readouterr().err
+    assert main([*command, "--set", "body.pressure=400000"]) == 0
