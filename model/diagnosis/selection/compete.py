@@ -160,22 +160,22 @@ def _initial_fits(problem: Problem, base: Fit, candidates: list[Candidate], know
 
 
 def _leading(problem: Problem, trials: list[Trial]) -> tuple[list[Trial], list[Trial]]:
-    """The trials, best first, whose fits are to be finished, and the others.
+    """The trials, best first, whose fits go on, and the others; of these the close ones count as they are.
 
-    Of fits that are far behind, the first few are finished if steps like their last one would bring them to the lead,
-    or what a refused one promised: from some starts the first steps are too few for their evidence to tell, and later
-    ones are shorter.
+    Of fits that are far behind, those go on that steps like their last one would bring to the lead, or what a refused
+    one promised: from some starts the first steps are too few for their evidence to tell, and later ones are shorter.
     """
     rules, best, least = problem.rules.selection, trials[0].evidence, trials[0].fit.chi_square
     leading, behind = [], []
     for rank, trial in enumerate(trials):
-        close = problem.process_noise or trial.evidence > best - max(rules.near, rules.near_share * abs(best))
+        far = not problem.process_noise and trial.evidence <= best - rules.near
+        close = rank < rules.finished and not (far and trial.evidence <= best - rules.near_share * abs(best))
         reach = (_PROMISED if trial.fit.refused else _FINISHING) * trial.fit.left
         falling = trial.fit.converged or trial.fit.chi_square - reach < least
-        if (rank < rules.last and falling) or (rank < rules.finished and close):
+        if (falling and rank < rules.last) or (close and (falling or not far)):
             leading.append(trial)
         else:
-            behind.append(replace(trial, finished=False))
+            behind.append(replace(trial, finished=close))
     return leading, behind
 
 

@@ -52,18 +52,19 @@ def test_what_could_lead_is_fitted_on_while_it_gets_further(
     assert order[0].evidence == leading
 
 
-def test_fits_far_behind_are_finished_only_where_further_steps_could_bring_them_to_the_lead() -> None:
+def test_fits_far_behind_go_on_only_where_further_steps_could_bring_them_to_the_lead() -> None:
     def first_fit(evidence: float, left: float, chi_square: float) -> Trial:
         one = trial(evidence, left)
         fit: Any = replace(one.fit, chi_square=chi_square)
         return replace(one, fit=fit)
 
-    best, near = first_fit(1000.0, 30.0, 200.0), first_fit(800.0, 0.1, 300.0)
+    best, near = first_fit(1000.0, 30.0, 200.0), first_fit(960.0, 0.1, 240.0)
+    close = first_fit(800.0, 0.1, 300.0)  # its evidence counts as it is
     hopeless, falling = first_fit(200.0, 70.0, 1000.0), first_fit(100.0, 95.0, 1100.0)
     problem: Any = SimpleNamespace(process_noise=False, rules=RULES)
-    leading, behind = compete._leading(problem, [best, near, hopeless])
+    leading, behind = compete._leading(problem, [best, near, close, hopeless])
     assert leading == [best, near]
-    assert behind == [replace(hopeless, finished=False)]
+    assert behind == [close, replace(hopeless, finished=False)]
     leading, behind = compete._leading(problem, [best, hopeless, falling])
     assert leading == [best, falling]
     assert behind == [replace(hopeless, finished=False)]
