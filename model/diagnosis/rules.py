@@ -429,6 +429,7 @@ class ComponentRules:
     trials_of_a_law: int = rule(10, "independent ones, of all its shapes; chosen: of some 10 to 40 in a grid", 5, 40)
     starts: int = rule(2, "trial shapes from which a law is refined; chosen", 1, 4)
     close: int = rule(6, "laws that are refined in every round; chosen", 4, 10)
+    firsts: int = rule(3, "laws beside which a second is sought where none predicts better; chosen", 2, 5)
     declared: float = rule(0.02, "of the force, up to which a declared noise is believed; chosen", 0.01, 0.05)
     surface_serves: float = rule(0.9, "of the held-out power that an unnamed force may leave; chosen", 0.8, 0.97)
     named: float = rule(0.8, "of the excess power; chosen: laws that leave more are not the component's", 0.6, 0.9)

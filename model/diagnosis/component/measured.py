@@ -155,6 +155,7 @@ def _record(
     given, held = given_model(system, element, sizes, notes)
     own = own_pieces(laws, element, sizes, notes)
     force = measured.force[run]
+    noise, at_rest = _noise(measured, rests, run, system.file.sensors[sensor], rules)
     task = ComponentTask(
         motion=motion.with_noise(measured.errors.deflection, measured.errors.rate),
         force=force,
@@ -162,7 +163,8 @@ def _record(
         nominal=NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping"))),
         rules=rules.component,
         signals=covariates(system, values, sample_rate, element, notes),
-        noise=_noise(measured, rests, run, system.file.sensors[sensor], rules),
+        noise=noise,
+        least_noise=at_rest,
         declared=system.file.sensors[sensor].noise,
         held=held,
         delay_std=min(_delay_std(system, sensor), 1 / sample_rate),
@@ -170,15 +172,16 @@ def _record(
     return ComponentRecord(element, sensor, task, tuple(notes), given, own)
 
 
-def _noise(measured: _Measured, rests: list[slice], run: slice, cell: Sensor, rules: Rules) -> float:
-    """Noise of a load cell that the record shows at standstill or in its fastest changes, N.
+def _noise(measured: _Measured, rests: list[slice], run: slice, cell: Sensor, rules: Rules) -> tuple[float, float]:
+    """Noise of a load cell that the record shows at standstill or in its fastest changes, N, and the former alone.
 
     Friction and stops change a force as fast as noise does: where the file declares the noise, it is no larger than
     declarations are wrong by.
     """
     force = without_motion(measured.force[run], measured.displacement[run], rules.white_noise)
-    shown = max(noise_at_rest(measured.force, rests) or 0.0, white_noise(force, rules.white_noise))
-    return min(shown, rules.noise.misdeclared * cell.noise) if cell.noise > 0 else shown
+    at_rest = noise_at_rest(measured.force, rests) or 0.0
+    most = rules.noise.misdeclared * cell.noise if cell.noise > 0 else np.inf
+    return min(max(at_rest, white_noise(force, rules.white_noise)), most), min(at_rest, most)
 
 
 @dataclass(frozen=True)

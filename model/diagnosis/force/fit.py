@@ -14,6 +14,7 @@ from sprung.model.diagnosis.force.parts import Part
 from sprung.model.diagnosis.force.piece import Values
 from sprung.model.diagnosis.force.sizes import MotionSizes
 from sprung.model.diagnosis.force.zero_drift import ZeroDrift
+from sprung.model.diagnosis.record.white_noise import white_noise
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.along import force_along
@@ -48,6 +49,7 @@ class ComponentTask:
     rules: ComponentRules = RULES.component
     signals: tuple[Covariate, ...] = ()  # on which its parameters may depend
     noise: float = 0.0  # N, of the force, estimated from the record without a model
+    least_noise: float = 0.0  # N, as much of it as is noise whatever a model leaves: seen at standstill
     declared: float = 0.0  # N, as stated in the system file; 0: not stated
     held: tuple[PlacedLaw, ...] = ()  # laws with fixed values
     delay_std: float = 0.0  # s, between the channels of force and motion, of the instruments
@@ -80,10 +82,10 @@ class ComponentTask:
     def _columns(self) -> dict[tuple[int, tuple[float, ...]], tuple[Part, FloatArray]]:
         return {}  # holds the piece, so that its id stays unique
 
-    @property
-    def bounded_noise(self) -> float:
-        """Noise of the load cell, N: as estimated from the record or declared, at most a fiftieth of the force."""
-        return max(self.noise, min(self.declared, self.rules.declared * float(np.std(self.force))))
+    @cached_property
+    def noisier(self) -> ComponentTask:
+        """The same along a motion with as much noise once more."""
+        return replace(self, motion=self.motion.noisier())
 
     def every(self, stride: int) -> ComponentTask:
         """The same thinned out."""
@@ -197,28 +199,39 @@ class ComponentFit:
         """Modelled force, N, (T,)."""
         return self.task.force - self.residual
 
-    @property
+    @cached_property
+    def noise(self) -> float:
+        """Noise of the load cell, N: as the record shows it, but no more than the fastest changes that are left.
+
+        Friction and stops change a force as fast as noise does: with them in the model, their jumps are no noise.
+        """
+        return min(self.task.noise, max(self.task.least_noise, white_noise(self.residual)))
+
+    @cached_property
     def motion_noise(self) -> float:
-        """Noise of the motion through spring and damper, N."""
-        motion = self.task.motion
-        return float(
-            np.hypot(self.element.stiffness * motion.deflection_noise, self.element.damping * motion.rate_noise)
-        )
+        """Noise of the motion through spring, damper and laws, N."""
+        motion, model = self.task.motion, self.model
+        linear = self.element.stiffness * motion.deflection_noise, self.element.damping * motion.rate_noise
+        by_laws = (model.columns(self.task.noisier) - model.columns(self.task)) @ self.strengths
+        return float(np.sqrt(np.sum(np.square(linear)) + np.mean(by_laws**2)))
 
     @property
     def at_noise(self) -> bool:
-        """Whether the residual is at the noise level estimated without a model: then no law is missing.
+        """Whether the residual is at the noise level that the record shows: then no law is missing.
 
         The noise of a differentiated motion lies in few bins, whose random patterns resemble laws.
         """
-        level = self.task.rules.at_noise * (self.task.noise**2 + self.motion_noise**2)
+        level = self.task.rules.at_noise * (self.noise**2 + self.motion_noise**2)
         return max(self.error, self.held_out) < level
 
     @property
     def floor(self) -> float:
-        """Noise floor of the force, N: bounded noise of the cell, and of the motion through spring and damper."""
+        """Noise floor of the force, N: of the cell, shown or declared, and of the motion.
+
+        What is declared, and the noise of the motion, count up to a fiftieth of the force.
+        """
         most = self.task.rules.declared * float(np.std(self.task.force))
-        return float(np.hypot(self.task.bounded_noise, min(self.motion_noise, most)))
+        return float(np.hypot(max(self.noise, min(self.task.declared, most)), min(self.motion_noise, most)))
 
     @property
     def leaves_more(self) -> bool:

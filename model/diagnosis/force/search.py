@@ -19,7 +19,7 @@ from sprung.model.diagnosis.force.lag import LAGS, Lag
 from sprung.model.diagnosis.force.parts import LawPiece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.pieces_following import pieces_following
-from sprung.model.diagnosis.force.ranking import Ranked, Step, next_laws, plausible, rank
+from sprung.model.diagnosis.force.ranking import Ranked, Step, is_last_determined, next_laws, plausible, rank
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count
 
@@ -60,7 +60,7 @@ def search(
     if composite:  # a law with many parameters may anticipate a sum of common ones
         progress(f"without {', '.join(sorted(composite))}")
         plainer = _grown(base, tuple(p for p in pieces if p.key not in composite), tests, progress)
-        grown = replace(_plainer_of(grown, plainer, rules), first=grown.first)
+        grown = replace(_plainer_of(grown, plainer, base, rules), first=grown.first)
     final = refined(fine, grown.current.fit.model)
     screened: dict[str, float] = {}
     for trial in grown.first:
@@ -90,23 +90,70 @@ def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, progres
         ranked = next_laws(current.fit, _beside(pieces, current.fit.model, given), rules)
         if number == 0:
             first = tuple(ranked)
-        step = accepted(current, ranked, base, rules, tests)
+        step = _late_beside_another(current, ranked, base, pieces, tests)
+        step = step or accepted(current, ranked, base, rules, tests)
+        if step is None and number == 0:
+            step = _second_of_two(current, ranked, base, pieces, tests)
         if step is None:
             break
         steps.append(step)
+        known = step.chosen if step.before is current else None
         current = _formed(_swapped(step.chosen, pieces, rules, given), rules, given)
-        if current is not step.chosen:  # an earlier law was exchanged, or one has another form
+        if current is not known:  # a law was exchanged, has another form, or came with the last one
             steps = _renamed(steps, current, given, tests, rules)
     return _SelectedLaws(current, tuple(steps), first)
 
 
-def _plainer_of(one: _SelectedLaws, other: _SelectedLaws, rules: ComponentRules) -> _SelectedLaws:
-    """The one that predicts the held-out part better; of two equal ones, that of commoner laws."""
+def _late_beside_another(
+    current: Ranked, ranked: list[Ranked], base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int
+) -> Step | None:
+    """A lag that leads, with one earlier law exchanged: late friction looks like hysteresis until its lag is known."""
+    rules, given = base.task.rules, len(base.model.pieces)
+    if not ranked or not isinstance(ranked[0].last, Lag):
+        return None
+    exchanged = _swapped(ranked[0], pieces, rules, given)
+    if exchanged is ranked[0]:
+        return None
+    model = exchanged.fit.model
+    lag = next(index for index, piece in enumerate(model.pieces) if isinstance(piece, Lag))
+    rest, task = model.without(lag), exchanged.fit.task
+    before, beside = refined(task, rest), fitted(task, rest.plus(model.pieces[lag], model.shapes[lag]))
+    return accepted(replace(current, fit=before), rank([beside], before, rules), base, rules, tests)
+
+
+def _second_of_two(
+    current: Ranked, ranked: list[Ranked], base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int
+) -> Step | None:
+    """The second of two laws that predict better than none, while either alone does not.
+
+    What one of them makes, the damper takes up beside the other: friction at the rates of the fitted part passes for
+    damping that falls with the rate, and so hides one that grows with it.
+    """
+    rules, given = base.task.rules, len(base.model.pieces)
+    firsts = [r for r in ranked if not isinstance(r.last, Lag) and r.evidence > 0 and is_last_determined(r.fit)]
+    found = []
+    for first in firsts[: rules.firsts]:
+        beside = tuple(piece for piece in _beside(pieces, first.fit.model, given) if not isinstance(piece, Lag))
+        step = accepted(first, next_laws(first.fit, beside, rules), base, rules, tests)
+        if step is not None and step.chosen.fit.held_out < current.fit.held_out:
+            found.append(step)
+    return min(found, key=lambda step: step.chosen.fit.error, default=None)
+
+
+def _plainer_of(one: _SelectedLaws, other: _SelectedLaws, base: ComponentFit, rules: ComponentRules) -> _SelectedLaws:
+    """The one that predicts the held-out part better; of two equal ones that of commoner laws.
+
+    other: found without the laws of many values in the first one; several likelier ones are what such a law stands for.
+    """
     fits = [grown.current.fit for grown in (one, other)]
     best = min(fit.held_out for fit in fits)
     alike = [
         g for g, fit in zip((one, other), fits, strict=True) if fit.held_out <= rules.as_well * best or fit.at_noise
     ]
+    if len(alike) > 1 and len(other.steps) > len(one.steps):
+        likelier, less_likely = rank(fits, base, rules)
+        if likelier.fit is other.current.fit and likelier.evidence > less_likely.evidence + rules.naming_margin:
+            return other
     return min(alike, key=lambda g: (sum(p.commoner for p in g.current.fit.model.pieces), g.current.fit.model.count))
 
 

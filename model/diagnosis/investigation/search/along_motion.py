@@ -172,6 +172,7 @@ def _sets_beside(state: Investigation, place: str, simulated: Fit, wrong: set[st
 def _task(state: Investigation, place: str, force: ForceAlongMotion, along: Fit) -> ComponentTask:
     """The force of an element along a motion, as that of a component test."""
     rules = state.options.rules
+    noise = white_noise(force.force, rules.white_noise)
     return ComponentTask(
         motion=ElementMotion.of(force.time, force.deflection, force.rate, 0.0, 0.0),
         force=force.force,
@@ -179,7 +180,8 @@ def _task(state: Investigation, place: str, force: ForceAlongMotion, along: Fit)
         nominal=_held(state.problem.system, place, along),
         # thinned out, the motion does not resolve the knees of valves
         rules=replace(rules.component, search=len(force.force)),
-        noise=white_noise(force.force, rules.white_noise),
+        noise=noise,
+        least_noise=noise,  # along a smoothed motion, what laws leave shows no noise of the force
     )
 
 
