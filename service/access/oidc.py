@@ -27,7 +27,7 @@ from urllib.parse import urlencode, urlsplit
 from cachetools import TTLCache
 
 from sprung.model.text import escaped
-from sprung.service.access import outside
+from sprung.service.access import outbound
 from sprung.service.access.tokens import SCOPES, Actor, Refused
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
@@ -269,7 +269,7 @@ class _Timed(http.client.HTTPConnection):
 
     def connect(self) -> None:
         super().connect()
-        self._ended = outside.hung_up_after(self.sock, SECONDS)
+        self._ended = outbound.hung_up_after(self.sock, SECONDS)
 
     def close(self) -> None:
         if self._ended is not None:

@@ -23,9 +23,9 @@ def door_app(settings: Settings, sizes: ServingSizes, migrated: bool, compute: A
         from ray import serve
 
         from sprung.service.api.live_ingest import ingest_app
-        from sprung.service.fleet.ray_behind import RayBehind
+        from sprung.service.fleet.ray_backend import RayBackend
 
-    return ingest_app(settings, open_store(settings.store_url, migrated), RayBehind(compute, sizes, serve.batch))
+    return ingest_app(settings, open_store(settings.store_url, migrated), RayBackend(compute, sizes, serve.batch))
 
 
 class ListeningDoor:

@@ -9,8 +9,8 @@ import typer
 
 from sprung import __version__
 from sprung.service.cli import fleet_commands, store_commands
+from sprung.service.cli.help_text import PlainTyper
 from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, finite_speed, vehicle_name
-from sprung.service.cli.plain import PlainTyper
 from sprung.service.processes.imports import lasting_imports
 from sprung.service.processes.threads import hand_over_often, one_thread_each
 

@@ -18,7 +18,7 @@ from sprung.replay.record import Record
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.console import errors, silent_stage, stages
-from sprung.service.cli.starts import start_time
+from sprung.service.cli.start_time import start_time
 from sprung.service.cli.stdin import CALLED, spooled
 from sprung.service.cli.targets import check_file, check_folder
 from sprung.service.diagnosis.improved import left_out, write_improved

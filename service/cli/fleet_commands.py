@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from sprung.service.cli.help_text import PlainTyper
 from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, finite_speed, vehicle_name
-from sprung.service.cli.plain import PlainTyper
 from sprung.service.processes.threads import one_thread_each
 
 Place = Annotated[str, typer.Argument(help="Folder of recordings, or an address such as s3://bucket/folder.")]

@@ -17,7 +17,7 @@ from sprung.service.cli.apart import own_limits, readable
 from sprung.service.cli.console import print_table, width_of_output
 from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.progress import progress
-from sprung.service.cli.starts import start_time
+from sprung.service.cli.start_time import start_time
 from sprung.service.cli.stdin import CALLED, spooled
 from sprung.service.jobs.recordings import add_row, file_row, finish_row
 from sprung.service.monitoring.compute import Compute

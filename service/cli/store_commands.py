@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from sprung.service.cli.help_text import PlainTyper
 from sprung.service.cli.options import Json, StoreUrl
-from sprung.service.cli.plain import PlainTyper
 
 token = PlainTyper(help="Access tokens: who may ask the service, and what for.", no_args_is_help=True)
 DataDir = Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", help="As of sprung serve.")]

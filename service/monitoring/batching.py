@@ -23,11 +23,11 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.service.errors import Busy
+from sprung.service.monitoring.batched_tracking import FoundWindow, track_together
 from sprung.service.monitoring.compute import Compute, Priority
 from sprung.service.monitoring.engines import ServedModel
+from sprung.service.monitoring.fair_queues import FairQueues
 from sprung.service.monitoring.pipeline import Pipeline
-from sprung.service.monitoring.together import FoundWindow, track_together
-from sprung.service.monitoring.turns import FairQueues
 from sprung.service.store.vehicle_models import SERVICE_FILE
 from sprung.service.store.windows import WindowRecord
 

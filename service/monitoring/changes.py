@@ -13,7 +13,7 @@ from sprung.service.monitoring.processed import HeldVehicle
 from sprung.service.monitoring.views import VehicleView, vehicle_view
 from sprung.service.store import fleet, history, status
 from sprung.service.store.circumstances import WindowCircumstances, add_circumstances
-from sprung.service.store.standing import UNINFORMATIVE
+from sprung.service.store.standstill import UNINFORMATIVE
 from sprung.service.store.status import NewStatus
 from sprung.service.store.windows import VehicleWindows, WindowRecord, add_windows
 

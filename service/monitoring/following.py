@@ -17,7 +17,7 @@ from sprung.service.monitoring.processed import HeldVehicle, WindowsToFold, outc
 from sprung.service.monitoring.views import in_kg, running
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
 from sprung.service.store.circumstances import WindowCircumstances
-from sprung.service.store.standing import counted
+from sprung.service.store.standstill import counted
 from sprung.service.store.windows import Posterior, StoredEstimate, WindowLoads, WindowRecord
 from sprung.service.times import AHEAD
 

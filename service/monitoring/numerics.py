@@ -9,7 +9,7 @@ from functools import partial
 
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.following import Following, FollowingApart, follow
-from sprung.service.monitoring.identifying import IdentifierApart, identifying_processes, placed_in
+from sprung.service.monitoring.identifier_processes import IdentifierApart, identifying_processes, placed_in
 from sprung.service.processes.forked import forks
 from sprung.service.settings import Settings
 

@@ -18,6 +18,7 @@ from sprung.service.monitoring.changes import OnAlarms, TrackerChange, keep_chan
 from sprung.service.monitoring.compute import Compute, Priority
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.engines import Engines, ServedModel
+from sprung.service.monitoring.fair_queues import Pace
 from sprung.service.monitoring.following import FollowedWindows, Following, follow
 from sprung.service.monitoring.processed import (
     Batch,
@@ -29,7 +30,6 @@ from sprung.service.monitoring.processed import (
     Newcomer,
     WindowsToFold,
 )
-from sprung.service.monitoring.turns import Pace
 from sprung.service.monitoring.views import VehicleView, vehicle_view
 from sprung.service.store import Store, fleet, status
 from sprung.service.store.partitions import prepare

@@ -19,7 +19,7 @@ from sprung.model.tracking.tracker import Alarm, TrackerState
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.words import spoken
 from sprung.service.store.fleet import AlarmRow
-from sprung.service.store.standing import UNINFORMATIVE
+from sprung.service.store.standstill import UNINFORMATIVE
 from sprung.service.store.status import Status
 from sprung.service.store.windows import WindowRecord
 from sprung.service.times import optional_iso, to_iso

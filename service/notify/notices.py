@@ -15,7 +15,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
-from sprung.service.access import outside
+from sprung.service.access import outbound
 from sprung.service.errors import UserError
 from sprung.service.notify import events, senders
 from sprung.service.settings import Settings
@@ -44,7 +44,7 @@ class Notices:
         self._working: dict[str, bool] = {}  # as reported last, by bus
         self._targets = receivers(settings)
         senders.signing_key(settings.webhook_secret)  # wrong ones are reported now
-        self._allowed = outside.networks(settings.webhook_networks)
+        self._allowed = outbound.networks(settings.webhook_networks)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sprung-notify", daemon=True)
 
@@ -140,10 +140,10 @@ class Notices:
 def receivers(settings: Settings) -> tuple[str, ...]:
     """Webhooks, then mail addresses as mailto:.  Raises UserError for one that cannot be."""
     found = []
-    allowed = outside.networks(settings.webhook_networks)
+    allowed = outbound.networks(settings.webhook_networks)
     for url in settings.webhooks:
         try:
-            _plainly_allowed(outside.safe_url(url).host, allowed)
+            _plainly_allowed(outbound.safe_url(url).host, allowed)
         except ValueError as error:
             raise UserError(f"setting webhooks (SPRUNG_WEBHOOKS): {error}") from None
         found.append(url)
@@ -156,12 +156,12 @@ def receivers(settings: Settings) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _plainly_allowed(host: str, allowed: tuple[outside.Network, ...]) -> None:
+def _plainly_allowed(host: str, allowed: tuple[outbound.Network, ...]) -> None:
     """A host that is written as an address is judged at the start; names when they are called."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
         return
-    wrong = outside.judged(address, allowed)
+    wrong = outbound.judged(address, allowed)
     if wrong is not None:
-        raise outside.ForbiddenAddress(wrong)
+        raise outbound.ForbiddenAddress(wrong)

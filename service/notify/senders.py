@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from email.message import EmailMessage
 from typing import Any
 
-from sprung.service.access import outside
+from sprung.service.access import outbound
 from sprung.service.errors import UserError
 from sprung.service.notify.events import sentence
 from sprung.service.settings import Settings
@@ -26,7 +26,7 @@ SUCCESS = range(200, 300)
 ENCODED = "whsec_"  # begins a secret in base64
 
 
-def post(url: str, event: dict[str, Any], secret: str | None, allowed: Sequence[outside.Network] = ()) -> None:
+def post(url: str, event: dict[str, Any], secret: str | None, allowed: Sequence[outbound.Network] = ()) -> None:
     """CloudEvents in structured mode, signed as Standard Webhooks (standardwebhooks.com) has it.
 
     allowed: networks that may be called although they are not public.  A receiver that moved must be told of in the
@@ -35,7 +35,7 @@ def post(url: str, event: dict[str, Any], secret: str | None, allowed: Sequence[
     body = json.dumps(event, allow_nan=False).encode()
     headers = {"Content-Type": "application/cloudevents+json", "User-Agent": "sprung"}
     headers |= signature(event["id"], int(time.time()), body, secret)
-    status = outside.post(url, body, headers, allowed, SECONDS)
+    status = outbound.post(url, body, headers, allowed, SECONDS)
     if status not in SUCCESS:
         raise ValueError(f"the receiver answered {status}")
 
@@ -72,7 +72,7 @@ class _BoundedSmtp(smtplib.SMTP):
 
     def _get_socket(self, host: str, port: int, timeout: float) -> socket.socket:
         line: socket.socket = super()._get_socket(host, port, timeout)  # type: ignore[misc]  # a hook that typeshed leaves out
-        self._ended = outside.hung_up_after(line, MAIL_SECONDS)
+        self._ended = outbound.hung_up_after(line, MAIL_SECONDS)
         return line
 
     def close(self) -> None:

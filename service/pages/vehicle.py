@@ -27,7 +27,7 @@ from sprung.service.rendering.render import percent, render
 from sprung.service.rendering.states import hints
 from sprung.service.store import fleet, lists, marks, status
 from sprung.service.store.fleet import WantedAlarms
-from sprung.service.store.standing import UNINFORMATIVE, standing_points
+from sprung.service.store.standstill import UNINFORMATIVE, standing_points
 from sprung.service.store.status import FleetRow
 from sprung.service.times import NANOSECONDS, to_iso
 

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, select, tuple_
 from sprung.service.store.engine import upsert
 from sprung.service.store.history import LEVELS, NICE
 from sprung.service.store.schema import circumstances
-from sprung.service.store.standing import STANDING
+from sprung.service.store.standstill import STANDING
 from sprung.service.store.windows import IN_LIMIT
 from sprung.service.times import NANOSECONDS
 

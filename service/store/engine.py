@@ -21,7 +21,7 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
 
 from sprung.model.text import first_line
 from sprung.service.errors import UserError
-from sprung.service.store.turns import Turns
+from sprung.service.store.write_lock import WriteLock
 
 BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
 PROBE_SECONDS = 2.0
@@ -39,7 +39,7 @@ class Store:
         event.listen(engine, "handle_error", _name_store)
         self.many_writers = engine.dialect.name == "postgresql"
         # one writer a process where the database has one anyway: waiting is fair here
-        self.turns = Turns(MOST_WRITERS if self.many_writers else 1)
+        self.write_lock = WriteLock(MOST_WRITERS if self.many_writers else 1)
         self.on_wait: Callable[[float], None] = lambda seconds: None  # takes each transaction's wait to write
         self.months: set[str] = set()  # partitions that are known to be there (`partitions.prepare`)
 
@@ -59,7 +59,7 @@ class Store:
         Raises SQLAlchemyError where its turn does not come, or the database does not take it.
         """
         asked = time.perf_counter()
-        with self.turns.turn(), self.engine.connect() as connection:
+        with self.write_lock.held(), self.engine.connect() as connection:
             connection.execution_options(sprung_write=True)
             with connection.begin():
                 self.on_wait(time.perf_counter() - asked)
@@ -67,7 +67,7 @@ class Store:
 
     def probe(self) -> None:
         """Raises SQLAlchemyError when nothing can be written now; changes nothing."""
-        with self.turns.turn(PROBE_SECONDS), self.engine.connect() as connection:
+        with self.write_lock.held(PROBE_SECONDS), self.engine.connect() as connection:
             sqlite_store = connection.dialect.name == "sqlite"
             if sqlite_store:
                 connection.exec_driver_sql(f"PRAGMA busy_timeout = {round(1000 * PROBE_SECONDS)}")

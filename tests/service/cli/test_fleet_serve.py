@@ -19,7 +19,7 @@ def test_ray_is_started_before_anything_imports_torch() -> None:
 
 
 def test_the_door_of_ray_serve_has_no_model() -> None:
-    assert imported("sprung.service.api.live_ingest, sprung.service.fleet.ray_behind") == {"fastapi"}
+    assert imported("sprung.service.api.live_ingest, sprung.service.fleet.ray_backend") == {"fastapi"}
 
 
 def test_replicas_import_of_scipy_what_they_need() -> None:

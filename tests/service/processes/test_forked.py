@@ -26,7 +26,7 @@ from sprung.model.system import MANCHESTER, System, parse_system
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine, engine_like, one_thread_an_operation, seconds_of_a_window
 from sprung.service.monitoring.following import FollowingApart, follow
-from sprung.service.monitoring.identifying import IdentifierApart, identifying_processes, placed_in
+from sprung.service.monitoring.identifier_processes import IdentifierApart, identifying_processes, placed_in
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import WindowsToFold
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded

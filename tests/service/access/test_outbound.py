@@ -15,13 +15,13 @@ from typing import Any
 
 import pytest
 
-from sprung.service.access import outside
+from sprung.service.access import outbound
 from sprung.service.errors import UserError
 from sprung.service.notify.notices import Notices
 from sprung.service.settings import Settings
 from sprung.service.store import Store
 
-LOCAL = outside.networks(("127.0.0.0/8", "::1"))
+LOCAL = outbound.networks(("127.0.0.0/8", "::1"))
 
 
 @pytest.mark.parametrize(
@@ -35,20 +35,20 @@ LOCAL = outside.networks(("127.0.0.0/8", "::1"))
     ],
 )  # fmt: skip
 def test_addresses_behind_the_wall_are_refused(address: str) -> None:
-    assert outside.judged(ipaddress.ip_address(address), ()) is not None
+    assert outbound.judged(ipaddress.ip_address(address), ()) is not None
 
 
 @pytest.mark.parametrize("address", ["93.184.216.34", "2606:2800:220:1:248:1893:25c8:1946"])
 def test_public_addresses_are_called(address: str) -> None:
-    assert outside.judged(ipaddress.ip_address(address), ()) is None
+    assert outbound.judged(ipaddress.ip_address(address), ()) is None
 
 
 def test_a_network_of_the_settings_opens_only_itself() -> None:
-    allowed = outside.networks(("10.1.0.0/16", "fd00::/8"))
-    assert outside.judged(ipaddress.ip_address("10.1.2.3"), allowed) is None
-    assert outside.judged(ipaddress.ip_address("fd12::1"), allowed) is None
-    assert outside.judged(ipaddress.ip_address("10.2.2.3"), allowed) is not None
-    assert outside.judged(ipaddress.ip_address("169.254.169.254"), allowed) is not None
+    allowed = outbound.networks(("10.1.0.0/16", "fd00::/8"))
+    assert outbound.judged(ipaddress.ip_address("10.1.2.3"), allowed) is None
+    assert outbound.judged(ipaddress.ip_address("fd12::1"), allowed) is None
+    assert outbound.judged(ipaddress.ip_address("10.2.2.3"), allowed) is not None
+    assert outbound.judged(ipaddress.ip_address("169.254.169.254"), allowed) is not None
 
 
 @pytest.mark.parametrize(
@@ -61,15 +61,15 @@ def test_a_network_of_the_settings_opens_only_itself() -> None:
 )  # fmt: skip
 def test_what_is_no_plain_url_is_refused(url: str) -> None:
     with pytest.raises(UserError):
-        outside.safe_url(url)
+        outbound.safe_url(url)
 
 
 @pytest.mark.parametrize(
     "host", ["localhost", "127.1", "2130706433", "0x7f000001", "017700000001", "[::1]", "[::ffff:127.0.0.1]"]
 )
 def test_other_ways_to_write_this_host_come_to_the_same(host: str) -> None:
-    with pytest.raises((outside.ForbiddenAddress, OSError)):
-        outside.post(f"http://{host}:9/x", b"", {}, (), 1.0)
+    with pytest.raises((outbound.ForbiddenAddress, OSError)):
+        outbound.post(f"http://{host}:9/x", b"", {}, (), 1.0)
 
 
 def test_every_address_of_a_name_is_judged(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,8 +77,8 @@ def test_every_address_of_a_name_is_judged(monkeypatch: pytest.MonkeyPatch) -> N
         return [(socket.AF_INET, 1, 6, "", (address, port)) for address in ("93.184.216.34", "169.254.169.254")]
 
     monkeypatch.setattr(socket, "getaddrinfo", both)
-    with pytest.raises(outside.ForbiddenAddress, match=r"169\.254\.169\.254 .*SPRUNG_WEBHOOK_NETWORKS"):
-        outside.resolved(outside.safe_url("https://both.example.org/"), ())
+    with pytest.raises(outbound.ForbiddenAddress, match=r"169\.254\.169\.254 .*SPRUNG_WEBHOOK_NETWORKS"):
+        outbound.resolved(outbound.safe_url("https://both.example.org/"), ())
 
 
 def test_a_name_that_changes_after_it_was_judged_is_not_asked_again(
@@ -92,9 +92,9 @@ def test_a_name_that_changes_after_it_was_judged_is_not_asked_again(
         assert len(calls) == 1, "resolved twice"
         return [(socket.AF_INET, 1, 6, "", ("127.0.0.1", number))]
 
-    receiver = outside.safe_url(f"http://hook.example.org:{port}/in?x=1")
-    monkeypatch.setattr(outside, "resolved", lambda *_: [entry[4][0] for entry in once(receiver.host, port)])
-    assert outside.post(f"http://hook.example.org:{port}/in?x=1", b"{}", {}, LOCAL, 5.0) == 302
+    receiver = outbound.safe_url(f"http://hook.example.org:{port}/in?x=1")
+    monkeypatch.setattr(outbound, "resolved", lambda *_: [entry[4][0] for entry in once(receiver.host, port)])
+    assert outbound.post(f"http://hook.example.org:{port}/in?x=1", b"{}", {}, LOCAL, 5.0) == 302
     assert hosts == [f"/in?x=1 hook.example.org:{port}"]  # and the redirection was not followed
 
 
@@ -144,6 +144,6 @@ def test_a_receiver_that_drips_is_hung_up_on() -> None:
         dripping.start()
         begun = time.monotonic()
         with pytest.raises((OSError, http.client.HTTPException)):
-            outside.post(f"http://127.0.0.1:{listening.getsockname()[1]}/", b"{}", {}, LOCAL, 0.5)
+            outbound.post(f"http://127.0.0.1:{listening.getsockname()[1]}/", b"{}", {}, LOCAL, 0.5)
         assert time.monotonic() - begun < 5.0
         dripping.join()

@@ -20,7 +20,7 @@ LOOK_SECONDS = 0.25
 LONGEST_WAIT = 60.0  # s, where the caller does not say
 
 
-class Turns:
+class WriteLock:
     """Lets `most` transactions at once write.  Safe to share between threads."""
 
     def __init__(self, most: int) -> None:
@@ -30,7 +30,7 @@ class Turns:
         self._writing: dict[object, float] = {}  # since when, monotonic s
 
     @contextmanager
-    def turn(self, seconds: float = LONGEST_WAIT) -> Iterator[None]:
+    def held(self, seconds: float = LONGEST_WAIT) -> Iterator[None]:
         """Wait for a turn, no longer than so many seconds.  Raises SQLAlchemy's TimeoutError where it would come too
         late."""
         me = object()

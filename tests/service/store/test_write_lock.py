@@ -8,8 +8,8 @@ from contextlib import ExitStack
 import pytest
 from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.service.store import turns as module
-from sprung.service.store.turns import Turns
+from sprung.service.store import write_lock as module
+from sprung.service.store.write_lock import WriteLock
 from tests.service_fakes import eventually
 
 
@@ -17,23 +17,23 @@ def test_behind_a_transaction_that_does_not_end_only_few_wait(monkeypatch: pytes
     """Each holds one of the threads that answer requests."""
     monkeypatch.setattr(module, "LOOK_SECONDS", 0.01)
     monkeypatch.setattr(module, "STUCK_SECONDS", 0.05)
-    turns, refused, wrote = Turns(1), threading.Semaphore(0), threading.Semaphore(0)
+    lock, refused, wrote = WriteLock(1), threading.Semaphore(0), threading.Semaphore(0)
 
     def write() -> None:
         try:
-            with turns.turn():
+            with lock.held():
                 wrote.release()
         except SQLAlchemyError:
             refused.release()
 
     threads = [threading.Thread(target=write) for _ in range(20)]
-    with turns.turn():
+    with lock.held():
         for thread in threads:
             thread.start()
         for _ in range(20 - module.MOST_BEHIND):
             assert refused.acquire(timeout=10)
         eventually(lambda: sum(thread.is_alive() for thread in threads) == module.MOST_BEHIND)
-        with pytest.raises(SQLAlchemyError, match="have not ended"), turns.turn():
+        with pytest.raises(SQLAlchemyError, match="have not ended"), lock.held():
             pass
     for thread in threads:
         thread.join(10)
@@ -44,13 +44,13 @@ def test_behind_a_transaction_that_does_not_end_only_few_wait(monkeypatch: pytes
 
 def test_a_turn_that_does_not_come_in_time_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "LOOK_SECONDS", 0.01)
-    turns = Turns(2)
+    lock = WriteLock(2)
     with ExitStack() as held:
-        held.enter_context(turns.turn())
-        held.enter_context(turns.turn())
-        with pytest.raises(SQLAlchemyError), turns.turn(0.02):
+        held.enter_context(lock.held())
+        held.enter_context(lock.held())
+        with pytest.raises(SQLAlchemyError), lock.held(0.02):
             pass
-    with turns.turn(0.0), pytest.raises(ZeroDivisionError), turns.turn(0.0):
+    with lock.held(0.0), pytest.raises(ZeroDivisionError), lock.held(0.0):
         raise ZeroDivisionError
-    with turns.turn(0.0):
+    with lock.held(0.0):
         pass

@@ -18,9 +18,9 @@ from sprung.model.signals import MeasurementFault
 from sprung.model.system import System
 from sprung.service.core import build_core
 from sprung.service.errors import Busy, UserError
-from sprung.service.fleet import ray_behind
+from sprung.service.fleet import ray_backend
 from sprung.service.fleet.message import IngestResult, SentWindows
-from sprung.service.fleet.ray_behind import RayBehind
+from sprung.service.fleet.ray_backend import RayBackend
 from sprung.service.fleet.ray_replicas import ComputeReplica
 from sprung.service.fleet.serving_sizes import ServingSizes
 from sprung.service.monitoring.batching import AskedWindow
@@ -101,9 +101,9 @@ class Handle:
     form: AskedForm
 
 
-def behind(**sizes: Any) -> tuple[RayBehind, Handle]:
+def behind(**sizes: Any) -> tuple[RayBackend, Handle]:
     handle = Handle(Remote(taken), AskedForm())
-    return RayBehind(handle, ServingSizes(**sizes), batch), handle
+    return RayBackend(handle, ServingSizes(**sizes), batch), handle
 
 
 def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
@@ -164,7 +164,7 @@ async def followed_on_ray(settings: Settings, sent: list[SentWindows]) -> dict[s
     replica = ComputeReplica(settings)
     methods = {name: Called(getattr(replica, name)) for name in ("form", "take")}
     with closing(replica._ingest):
-        ray = RayBehind(SimpleNamespace(**methods), ServingSizes(replicas=1), batch)
+        ray = RayBackend(SimpleNamespace(**methods), ServingSizes(replicas=1), batch)
         for one in sent:
             assert (await ray.identify_and_fold(one)).folded == len(one.starts)
         return replica._ingest._pipeline.state(sent[0].vehicle).to_dict()
@@ -204,7 +204,7 @@ def test_what_the_tracker_knows_of_a_vehicles_sensors_counts_as_in_a_single_proc
 
 
 def test_faults_that_are_over_and_those_of_too_many_vehicles_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_behind, "MOST_FAULTY", 2)
+    monkeypatch.setattr(ray_backend, "MOST_FAULTY", 2)
     fault: tuple[MeasurementFault, ...] = (MeasurementFault("car_1l", "frozen", 0.0),)
     told: list[tuple[MeasurementFault, ...]] = []
     wrong = {f"v-{number}" for number in range(5)}
@@ -215,7 +215,7 @@ def test_faults_that_are_over_and_those_of_too_many_vehicles_are_forgotten(monke
 
     async def asked() -> None:
         handle = SimpleNamespace(take=Called(take), form=AskedForm())
-        ray = RayBehind(handle, ServingSizes(replicas=1), batch)
+        ray = RayBackend(handle, ServingSizes(replicas=1), batch)
         send = partial(_sent_one_by_one, ray)
         await send(["v-1", "v-1"])
         assert told[-1] == fault
@@ -231,6 +231,6 @@ def test_faults_that_are_over_and_those_of_too_many_vehicles_are_forgotten(monke
     asyncio.run(asked())
 
 
-async def _sent_one_by_one(ray: RayBehind, vehicles: list[str]) -> None:
+async def _sent_one_by_one(ray: RayBackend, vehicles: list[str]) -> None:
     for number, vehicle in enumerate(vehicles):
         await ray.identify_and_fold(window(vehicle, number))

@@ -19,7 +19,7 @@ _Asked = tuple[SentWindows, tuple[MeasurementFault, ...]]  # windows, and what i
 MOST_FAULTY = 10_000  # vehicles whose faults are held; one that is heard from again is told anew with its first window
 
 
-class RayBehind:
+class RayBackend:
     """What the door sees of them.  Requests are put together here: a call costs more than a window's identification,
     so that one carries the windows, or the messages, of all that ask at a time."""
 
