@@ -51,6 +51,7 @@ class Feeds:
     speed: float = 0.0  # times real time; 0: as fast as possible
     buses: tuple[str, ...] = ()  # INTERFACE:CHANNEL[,OPTION=VALUE...]
     vehicle: str | None = None
+    start: int | None = None  # ns since 1970, when the file began, if its times count from 0
 
 
 class Interrupted(Exception):
@@ -157,7 +158,7 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
     for path in feeds.files:
         on_batch, on_end = watch(path, core)
         try:
-            row = file_row(path)
+            row = file_row(path, feeds.start)
             retry(partial(add_row, core.store, row), path.name, check)
             fed = feed_file(
                 core.pipeline,
@@ -167,6 +168,7 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
                 batch_windows=core.settings.batch_windows,
                 speed=feeds.speed,
                 limits=_limits(core.settings, path, feeds.speed),
+                start=feeds.start,
                 on_batch=on_batch,
                 on_tally=core.tally_counter("file"),
                 check=check,

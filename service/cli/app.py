@@ -10,7 +10,7 @@ import typer
 from sprung import __version__
 from sprung.service.cli import fleet_commands, store_commands
 from sprung.service.cli.help_text import PlainTyper
-from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, finite_speed, vehicle_name
+from sprung.service.cli.options import Dbc, Json, Start, StoreUrl, System, Weights, finite_speed, vehicle_name
 from sprung.service.processes.imports import lasting_imports
 from sprung.service.processes.threads import hand_over_often, one_thread_each
 
@@ -29,14 +29,6 @@ Files = Annotated[
 ]
 File = Annotated[
     Path, typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4, CSV and other tables; - is stdin.", metavar="FILE")
-]
-Start = Annotated[
-    str | None,
-    typer.Option(
-        "--start",
-        metavar="TIME",
-        help="When the recording began, if its times count from 0; default: the file's own time.",
-    ),
 ]
 Vehicle = Annotated[
     str | None,
@@ -131,6 +123,7 @@ def serve(
         ),
     ] = None,
     vehicle: Vehicle = None,
+    start: Start = None,
 ) -> int:
     """Run the service: API, metrics and pages.
 
@@ -149,7 +142,7 @@ def serve(
         "host": host,
         "port": port,
     }
-    return run(options, replay_files or [], speed, can or [], vehicle)
+    return run(options, replay_files or [], speed, can or [], vehicle, start)
 
 
 @app.command()
@@ -230,6 +223,7 @@ def simulate(
         bool, typer.Option("--noise", metavar="NUMBER", help="Add the sensors' noise of the system file.")
     ] = False,
     seed: Annotated[int, typer.Option("--seed", metavar="NUMBER", help="Seed of the noise.")] = 0,
+    start: Start = None,
 ) -> int:
     """Simulate a vehicle's sensors, and write a recording.
 
@@ -237,7 +231,7 @@ def simulate(
     """
     from sprung.service.cli.simulate import simulate as run
 
-    return run(system_file, inputs, out, dbc, settings or [], noise, seed)
+    return run(system_file, inputs, out, dbc, settings or [], noise, seed, start)
 
 
 @app.command()
@@ -251,6 +245,9 @@ def compare(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="PATH", help="Folder for pictures of signals and force loops.")
     ] = None,
+    start: Annotated[
+        str | None, typer.Option("--start", metavar="TIME", help="When A began, if its times count from 0.")
+    ] = None,
     json_lines: Json = False,
 ) -> int:
     """Compare a simulation with a recording.
@@ -259,7 +256,7 @@ def compare(
     """
     from sprung.service.cli.simulate import show as run
 
-    return run(measured, other, system, dbc, out, json_lines)
+    return run(measured, other, system, dbc, out, json_lines, start)
 
 
 @app.command()
@@ -289,7 +286,10 @@ def experiment(
 @app.command()
 def inspect(
     file: File,
-    system: Annotated[Path | None, typer.Option("--system", help="Take `time:` from this system file.")] = None,
+    system: Annotated[
+        Path | None,
+        typer.Option("--system", metavar="FILE", help="Take time and CAN database as this system file says."),
+    ] = None,
     dbc: Dbc = None,
     time_column: Annotated[str | None, typer.Option("--time-column", help="Time column of a table.")] = None,
     time_unit: Annotated[str | None, typer.Option("--time-unit", help="Unit of that column: s, ms, us, ns ...")] = None,
@@ -408,6 +408,7 @@ def export(
 @app.command()
 def doctor(
     system: System = None,
+    dbc: Dbc = None,
     store: StoreUrl = None,
     weights: Weights = None,
     data_dir: Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", help="As for sprung serve.")] = None,
@@ -417,12 +418,13 @@ def doctor(
 ) -> int:
     """Check the installation; a line each, and what to do.
 
-    Packages, model, store, disk, clock and buses.
+    Packages, model, CAN database, store, disk, clock and buses.
     """
     one_thread_each()
     from sprung.service.cli.doctor import run
 
-    return run(system, weights, store, data_dir, can or [])
+    options = {"system": system, "dbc": dbc, "weights": weights, "store": store, "data_dir": data_dir}
+    return run(options, can or [])
 
 
 @app.command(  # a benchmark's own help is printed by it

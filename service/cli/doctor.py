@@ -9,8 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
-from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import can
 from packaging.requirements import Requirement
@@ -20,6 +19,8 @@ from sprung.model.identification.identify import Identifier, load_identifier, wi
 from sprung.model.system import load_system
 from sprung.model.text import counted
 from sprung.replay.bus import not_only_listened_to, opening_options, parse_bus
+from sprung.replay.candecode import CanDecoder
+from sprung.service.can_database import database_of
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
 from sprung.service.store.status import StatusFilter, health_counts
@@ -38,11 +39,11 @@ class Check:
     text: str
 
 
-def run(system: Path | None, weights: Path | None, store: str | None, data_dir: Path | None, buses: list[str]) -> int:
-    """Print a line for every check; 1 when one of them failed."""
-    settings = settings_with({"system": system, "weights": weights, "store": store, "data_dir": data_dir})
+def run(options: dict[str, Any], buses: list[str]) -> int:
+    """Print a line for every check; 1 when one of them failed.  options: of the service, as for `sprung serve`."""
+    settings = settings_with(options)
     failed = False
-    for check in (_installation, _model, _store, _disk, _clock):
+    for check in (_installation, _model, _database, _store, _disk, _clock):
         for finding in _guarded(check, settings):
             failed |= finding.state == "failed"
             print(f"{finding.state:8s} {finding.what}: {finding.text}", flush=True)
@@ -96,6 +97,19 @@ def _model(settings: Settings) -> Iterator[Check]:
         yield Check("warning", "model", text)
     else:
         yield Check("ok", "model", f"{system.name}, {parameters}, with a trained estimator")
+
+
+def _database(settings: Settings) -> Iterator[Check]:
+    system = load_system(settings.system) if settings.system is not None else load_system()
+    signals = sum(channel.can is not None for channel in system.channels)
+    database = database_of(system, settings.dbc)
+    if database is not None:
+        CanDecoder((*system.channels, *system.auxiliary), database)
+        yield Check("ok", "database", f"{database} has the {counted(signals, 'CAN signal')} of {system.name}")
+    elif signals:
+        yield Check("warning", "database", f"{system.name} has {counted(signals, 'CAN signal')}; name one with --dbc")
+    else:
+        yield Check("ok", "database", f"none is needed: {system.name} has no CAN signals")
 
 
 def _store(settings: Settings) -> Iterator[Check]:

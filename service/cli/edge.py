@@ -19,6 +19,7 @@ from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
 from sprung.service.cli import apart
 from sprung.service.cli.apart import readable
+from sprung.service.cli.start_time import start_time
 from sprung.service.errors import UserError
 from sprung.service.fleet.nats_broker import NatsLink
 from sprung.service.fleet.onboard import Onboard, OnboardCounts, OnboardSettings
@@ -68,12 +69,14 @@ class EdgeRequest:
     spool: Path | None  # file of messages that wait; None: in the data folder
     spool_bytes: int
     speed: float  # of recordings, times real time; 0: no pause
+    start: str | None  # when the recording began, if its times count from 0
     rates: OnboardSettings
 
 
 def run(request: EdgeRequest, json_lines: bool) -> int:
     """Identify on board and send, until the files end or it is stopped."""
     _check(request)
+    began = start_time(request.start, request.files)
     settings = settings_with(request.settings)
     set_up(settings.log_format, settings.log_level)
     engine = load_engine(settings)
@@ -89,7 +92,7 @@ def run(request: EdgeRequest, json_lines: bool) -> int:
         sending.start()
         stack.callback(sending.stop)  # whatever ends it: the spool is closed next
         if request.files:
-            _from_files(onboard, engine, request.files, name, request.speed, sending)
+            _from_files(onboard, engine, request.files, name, request.speed, began, sending)
         else:
             _from_bus(onboard, engine, request.bus or "", name, settings)
         onboard.flush()
@@ -152,9 +155,17 @@ def _line(summary: dict[str, Any]) -> str:
     )
 
 
-def _from_files(onboard: Onboard, engine: Engine, files: list[Path], name: str, speed: float, sending: Sending) -> None:
+def _from_files(
+    onboard: Onboard,
+    engine: Engine,
+    files: list[Path],
+    name: str,
+    speed: float,
+    start: int | None,
+    sending: Sending,
+) -> None:
     for path in files:
-        reading = apart.reading(ReadRequest(path, engine.system, engine.dbc, 32, speed))
+        reading = apart.reading(ReadRequest(path, engine.system, engine.dbc, 32, speed, start))
         for piece in reading.pieces(lambda: None):
             onboard.process(name, piece.windows)
             sending.wake()

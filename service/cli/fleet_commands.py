@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from sprung.service.cli.help_text import PlainTyper
-from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights, finite_speed, vehicle_name
+from sprung.service.cli.options import Dbc, Json, Start, StoreUrl, System, Weights, finite_speed, vehicle_name
 from sprung.service.processes.threads import one_thread_each
 
 Place = Annotated[str, typer.Argument(help="Folder of recordings, or an address such as s3://bucket/folder.")]
@@ -62,6 +62,7 @@ def edge(
             callback=finite_speed,
         ),
     ] = 0.0,
+    start: Start = None,
     system: System = None,
     dbc: Dbc = None,
     weights: Weights = None,
@@ -80,7 +81,7 @@ def edge(
     rates = OnboardSettings(message_seconds=message_seconds, weigh_seconds=weigh_seconds, raw_seconds=raw_seconds)
     options: dict[str, Any] = {"system": system, "dbc": dbc, "weights": weights}
     destination = Destination(server, recordings, token)
-    request = EdgeRequest(options, files or [], can, destination, vehicle, spool, spool_bytes, speed, rates)
+    request = EdgeRequest(options, files or [], can, destination, vehicle, spool, spool_bytes, speed, start, rates)
     return run(request, json_lines)
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 from rich.table import Table
 
 from sprung.model.signals import TimeColumn
-from sprung.model.system import load_system
+from sprung.model.system import System, load_system
 from sprung.model.text import escaped
 from sprung.model.units import FACTORS, known
 from sprung.replay.inspection import Inspection, Signal
 from sprung.replay.skeleton import skeleton
+from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.console import print_table
 from sprung.service.cli.targets import check_file
@@ -36,8 +37,10 @@ def run(
 ) -> int:
     """Print the contents of a recording; 1 if part of it could not be read."""
     check_file(write_system)
-    time, said = _time(system_file, column, unit, rate)
-    found = apart.look(InspectionRequest(file, dbc, time))
+    system = None if system_file is None else load_system(system_file)
+    time, said = _time(system, column, unit, rate)
+    database = dbc if system is None else database_of(system, dbc)
+    found = apart.look(InspectionRequest(file, database, time))
     if write_system is not None:
         _write(write_system, skeleton(found, file.stem, said))
     if json_lines:
@@ -53,11 +56,12 @@ def run(
 
 
 def _time(
-    system_file: Path | None, column: str | None, unit: str | None, rate: float | None
+    system: System | None, column: str | None, unit: str | None, rate: float | None
 ) -> tuple[TimeColumn, dict[str, object]]:
     """The time as the system file or the options say, and what to write about it into a skeleton."""
-    if system_file is not None:
-        system = load_system(system_file)
+    if system is not None:
+        if (column, unit, rate) != (None, None, None):
+            raise UserError("the system file says how times are read: give it, or --time-column, --time-unit, --rate")
         return system.time, system.file.time.model_dump(exclude_none=True, mode="json")
     name = known(unit, "s") if unit else None
     if unit and name not in FACTORS["s"]:

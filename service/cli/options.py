@@ -20,6 +20,14 @@ Dbc = Annotated[
         "--dbc", metavar="FILE", help="CAN database; default: the bundled one, where it has the system's signals."
     ),
 ]
+Start = Annotated[
+    str | None,
+    typer.Option(
+        "--start",
+        metavar="TIME",
+        help="When the recording began, if its times count from 0; default: the file's own time.",
+    ),
+]
 Weights = Annotated[
     Path | None,
     typer.Option("--weights", metavar="FOLDER", help="Trained estimator; default: the bundled one."),

@@ -15,6 +15,7 @@ from sprung.service.cli.console import print_table, width_of_output
 from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.progress import plain_progress
 from sprung.service.cli.replay import closing_line, health, incomplete_line
+from sprung.service.cli.start_time import start_time
 from sprung.service.cli.targets import check_folder
 from sprung.service.core import Core
 from sprung.service.main import Feeds, serve
@@ -24,8 +25,16 @@ from sprung.service.settings import settings_with
 from sprung.service.sources.feed import FeedResult, OnBatch
 
 
-def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[str], vehicle: str | None) -> int:
+def run(
+    options: dict[str, Any],
+    files: list[Path],
+    speed: float,
+    buses: list[str],
+    vehicle: str | None,
+    start: str | None = None,
+) -> int:
     """Serve until stopped."""
+    began = start_time(start, files)
     for path in files:
         readable(path)
     settings = settings_with(options)
@@ -42,7 +51,7 @@ def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[st
         )
 
     with suppress(KeyboardInterrupt):  # the usual way to stop
-        serve(settings, Feeds(tuple(files), speed, tuple(buses), vehicle), watch, announce)
+        serve(settings, Feeds(tuple(files), speed, tuple(buses), vehicle, began), watch, announce)
     return 0
 
 

@@ -19,6 +19,7 @@ from sprung.replay.record import Record
 from sprung.replay.writing import WRITERS, UnwritableRecording, without_address, write_recording
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
+from sprung.service.cli.start_time import start_time
 from sprung.service.cli.targets import check_file, check_folder
 from sprung.service.errors import UserError
 from sprung.service.report.recordings import SYSTEM_FILES, Comparison, compare
@@ -33,6 +34,7 @@ def simulate(
     settings: list[str],
     noise: bool,
     seed: int,
+    start: str | None = None,
     catalogue: tuple[Law, ...] = CATALOGUE,
 ) -> int:
     """Write the recording that a vehicle with the file's laws would give on the inputs of another one."""
@@ -44,7 +46,8 @@ def simulate(
     system = load_system(system_file, catalogue)
     database = database_of(system, dbc)
     changed, circumstances = _settings(system, settings)
-    request = RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, None)
+    began = start_time(start, [inputs])
+    request = RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, began)
     drive = apart.load_driving(DrivingRequest(request, system.auxiliary))
     record = drive.record
     driven = record.values[:, : len(system.inputs)]
@@ -136,16 +139,18 @@ def show(
     dbc: Path | None,
     out: Path | None,
     json_lines: bool,
+    start: str | None = None,
     catalogue: tuple[Law, ...] = CATALOGUE,
 ) -> int:
     """Print the errors of every sensor; with a folder, draw them.  A system file alone reads the recording, too."""
     check_folder(out)
     simulated = other if other.suffix.lower() in SYSTEM_FILES else MANCHESTER
     system = load_system(system_file or simulated, catalogue)
-    database = database_of(system, dbc)
+    database, began = database_of(system, dbc), start_time(start, [measured])
 
     def load(path: Path) -> Record:
-        return apart.load(RecordRequest(path, system.channels, system.sample_rate, database, system.time, None))
+        at = began if path == measured else None
+        return apart.load(RecordRequest(path, system.channels, system.sample_rate, database, system.time, at))
 
     found = compare(measured, other, system, load)
     per_sensor = {

@@ -13,7 +13,7 @@ def start_time(text: str | None, files: Sequence[Path]) -> int | None:
     """Nanoseconds since 1970; raises UserError when it is no time, or when it cannot be that of several files."""
     if text is None:
         return None
-    if len(files) > 1:
+    if len(files) != 1:
         raise UserError("--start says when one recording began; give one FILE with it")
     try:
         return from_iso(text)

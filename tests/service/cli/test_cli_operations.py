@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import json
+import math
 import os
 import re
 import signal
@@ -16,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from can import BusState
 from mcap.reader import make_reader
 from sqlalchemy import text
@@ -23,6 +26,7 @@ from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import MANCHESTER
 from sprung.service.cli import describe, main
+from sprung.service.cli.app import app
 from sprung.service.cli.diagnose import text as text_of
 from sprung.service.cli.doctor import _bus
 from sprung.service.cli.parameters import parameter_table
@@ -204,6 +208,92 @@ def test_doctor_tells_what_works_and_what_does_not(tmp_path: Path, capsys: pytes
     assert "failed   bus socketcan:can9" in capsys.readouterr().out
     (tmp_path / "broken.db").write_bytes(b"this is no database" * 100)
     assert main(["doctor", "--store", str(tmp_path / "broken.db"), "--data-dir", str(tmp_path)]) == 1
+
+
+@pytest.mark.parametrize(
+    ("system", "dbc", "status", "told"),
+    [
+        (None, None, 0, "ok       database: "),
+        (None, "other.dbc", 1, "failed   database: channel "),
+        (None, "absent.dbc", 1, "failed   database: "),
+        ("other.yaml", None, 0, "warning  database: strut has 1 CAN signal; name one with --dbc"),
+        ("other.yaml", "other.dbc", 0, "has the 1 CAN signal of strut"),
+        ("tables.yaml", None, 0, "ok       database: none is needed"),
+    ],
+)
+def test_doctor_says_whether_the_can_database_fits_the_vehicle(
+    system: str | None, dbc: str | None, status: int, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (
+        "name: strut\nsample_rate: 100\nwindow: 100\nbodies:\n  body: {mass: 400}\n"
+        "inputs:\n  road: {kind: support, displacement: {csv: z}}\n"
+        "elements:\n  strut: {upper: body, lower: road, stiffness: 2.0e+4, damping: 1500}\n"
+        "sensors:\n  top: {kind: acceleration, body: body, csv: a}\n"
+    )
+    (tmp_path / "tables.yaml").write_text(text)
+    (tmp_path / "other.yaml").write_text(text.replace("csv: a", "can: Other.a"))
+    (tmp_path / "other.dbc").write_text('VERSION ""\nBU_: X\nBO_ 1 Other: 8 X\n SG_ a : 0|16@1- (1,0) [0|0] "" X\n')
+    options = ["--store", str(tmp_path / "s.db"), "--data-dir", str(tmp_path)]
+    for option, name in (("--system", system), ("--dbc", dbc)):
+        options += [] if name is None else [option, str(tmp_path / name)]
+    assert main(["doctor", *options]) == status
+    assert told in capsys.readouterr().out
+
+
+def options_of(command: str) -> set[str]:
+    """Of a command, as its help names them."""
+    found: Any = typer.main.get_command(app)
+    for name in command.split():
+        found = found.commands[name]
+    return {option for parameter in found.params for option in parameter.opts}
+
+
+def test_commands_that_open_a_recording_take_the_same_options() -> None:
+    one = ["replay", "serve", "edge", "diagnose", "simulate", "compare", "inspect"]
+    for command in (*one, "train", "doctor", "fleet backfill", "fleet diagnose"):
+        assert "--dbc" in options_of(command), command
+        assert command == "simulate" or "--system" in options_of(command), command  # it is SYSTEM there
+    for command in set(one) - {"inspect"}:  # which shows times as they are
+        assert "--start" in options_of(command), command
+    assert "--weights" in options_of("doctor") & options_of("edge") & options_of("serve") & options_of("replay")
+
+
+def test_a_start_is_that_of_one_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start, ride = ["--start", "2026-09-21T14:13:20Z"], str(RIDE)
+    for command in (
+        ["serve", *start],
+        ["serve", *start, "--replay", ride, "--replay", ride],
+        ["edge", *start, "--server", "http://127.0.0.1:9", "--can", "virtual:x"],
+    ):
+        assert main([*command, "--data-dir", str(tmp_path)] if command[0] == "serve" else command) == 2
+        assert "--start says when one recording began; give one FILE" in capsys.readouterr().err
+
+
+def test_a_simulated_ride_begins_when_its_inputs_are_said_to_have(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "car.yaml").write_text(
+        "name: strut\nsample_rate: 100\nwindow: 100\nbodies:\n  body: {mass: 400}\n"
+        "inputs:\n  road: {kind: support, displacement: {csv: z}, velocity: {csv: w}}\n"
+        "elements:\n  strut: {upper: body, lower: road, stiffness: 2.0e+4, damping: 1500}\n"
+        "sensors:\n  top: {kind: acceleration, body: body, csv: a}\n"
+    )
+    rows = "\n".join(f"{i / 100:.2f},{math.sin(i / 9):.6f},{100 / 9 * math.cos(i / 9):.6f},0" for i in range(400))
+    (tmp_path / "in.csv").write_text(f"time,z,w,a\n{rows}\n")
+    car, given, made = (str(tmp_path / name) for name in ("car.yaml", "in.csv", "out.csv"))
+    assert main(["simulate", car, "--inputs", given, "--out", made, "--start", "2026-09-21T14:13:20Z"]) == 0
+    assert Path(made).read_text().splitlines()[1].startswith("1790000000.0")
+    capsys.readouterr()
+    assert main(["compare", given, made, "--system", car, "--start", "2026-09-21T14:13:21Z", "--json"]) == 0
+    assert main(["compare", given, made, "--system", car, "--start", "noon"]) == 2
+    assert main(["inspect", given, "--system", car, "--time-unit", "s"]) == 2
+    assert "the system file says how times are read" in capsys.readouterr().err
+
+
+def test_a_vehicle_s_frames_are_shown_with_its_database(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(RIDE), "--system", str(MANCHESTER), "--json"]) == 0
+    named = {signal["address"].get("can") for signal in json.loads(capsys.readouterr().out)["signals"]}
+    assert "CarAcceleration.CarAccelerationFrontLeft" in named
 
 
 def test_export_of_an_unknown_vehicle_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
