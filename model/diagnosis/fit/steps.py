@@ -20,6 +20,7 @@ _MUCH = 0.03  # of chi-square, that a step promises: if it fails, initial state 
 _STARTS, _LOWER = 5, 0.01  # of these, at most, while each lowers the objective by this share
 _FAST, _PARALLEL = 0.3, 0.9  # ratio of steps that converge soon enough; cosine of steps whose ratio counts
 _RELAXED = (0.3, 2.0)  # least and most of a step that is taken
+_EQUIVALENTS = (2, 4)  # accepted steps after which the laws' linear equivalents are renewed
 _HOPEFUL = 0.5  # of the fall that is needed, that it has to promise; where it succeeded, it promised 0.96 and more
 
 
@@ -118,13 +119,29 @@ def stepped(problem: Problem, search: FitSearch, count: int, tolerance: float) -
         if proposed.value >= search.state.value:
             return replace(search, left=promised, relaxation=StepRelaxation())
     if proposed.value < search.state.value:
-        search = search.accepted(proposed)
-        if size < tolerance:  # what it fell besides, by inputs smoothed anew, is not left
-            return replace(search, left=min(search.left, promised), ended=True)
-        if search.left < rules.done * grain * max(1.0, size):
-            return replace(search, ended=True)
-        return search.with_equivalents(problem) if count in (2, 4) else search
-    if search.renewed is not None and promised < min(search.renewed, rules.told * grain):
+        return _accepted(problem, search.accepted(proposed), count, promised, grain, size, tolerance)
+    return _refused(problem, search, promised, grain, size, tolerance)
+
+
+def _accepted(
+    problem: Problem, search: FitSearch, count: int, promised: float, grain: float, size: float, tolerance: float
+) -> FitSearch:
+    """The search after a step that lowered the objective; ended where what is left is too little to matter.
+
+    size: of the step, in standard deviations.
+    """
+    if size < tolerance:  # what it fell besides, by inputs smoothed anew, is not left
+        return replace(search, left=min(search.left, promised), ended=True)
+    if search.left < problem.rules.fit.done * grain * max(1.0, size):
+        return replace(search, ended=True)
+    return search.with_equivalents(problem) if count in _EQUIVALENTS else search
+
+
+def _refused(
+    problem: Problem, search: FitSearch, promised: float, grain: float, size: float, tolerance: float
+) -> FitSearch:
+    """The search after a step that did not: with finer sensitivities or more damping, or ended."""
+    if search.renewed is not None and promised < min(search.renewed, problem.rules.fit.told * grain):
         return replace(search, left=0.0, ended=True)  # nothing that smoothing the inputs does not move as much
     if promised > _MUCH * search.state.chi_square and search.state.lin.may_be_finer:
         return search.finer(promised)

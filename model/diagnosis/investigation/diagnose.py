@@ -13,6 +13,7 @@ from sprung.model.diagnosis.investigation.configuration.effects import Hypothesi
 from sprung.model.diagnosis.investigation.configuration.fitted import FittedSetup
 from sprung.model.diagnosis.investigation.configuration.search import without_setup_faults
 from sprung.model.diagnosis.investigation.judgement.judgement import (
+    HeldOutRuns,
     another_structure,
     judged,
     unmeasured_share,
@@ -147,16 +148,14 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     if fewer is not None:
         return concluded(fewer, progress)
     before, after = state.held.runs(state.base.point, state.fit.point)
-    noisy = noise_faults(state, before, after)
-    judgement = judged(state, before, after, noisy, ended)
-    if exceeds_noise(state) or np.any(judgement.errors.unexplained(state.options.rules.verdict) > 0):
+    runs = HeldOutRuns.of(state, before, after, noise_faults(state, before, after))
+    if exceeds_noise(state) or np.any(runs.errors.unexplained(state.options.rules.verdict) > 0):
         wider = misfit_covariance(state.problem, state.fit)
         final = replace(final, covariance=final.covariance + wider)
         # masses and instruments that are off by less than their stated deviations are no faults either
         stated = (1 + moving) * state.fit.covariance + added + wider
         state = replace(state, fit=replace(state.fit, covariance=stated))
-        judgement = judged(state, before, after, noisy, ended)
-    return Outcome(state, final, before, after, noisy, judgement)
+    return Outcome(state, final, before, after, runs.noisy, judged(state, runs, ended))
 
 
 def under(state: Investigation, rules: Rules) -> Investigation:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,22 +25,37 @@ from sprung.model.signals import FloatArray
 _BAND = 0.8  # of the residual's power, in the band that is reported
 
 
-def judged(
-    state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...], ended: str = ""
-) -> Judgement:
+@dataclass(frozen=True)
+class HeldOutRuns:
+    """The held-out part simulated without and with the findings, beside its noise."""
+
+    before: FreeRun
+    after: FreeRun
+    noisy: tuple[NoiseFault, ...]  # sensors with a noise that only their peers speak against
+    noise: Noise  # as far as bounded
+    floor: FloatArray  # bounded noise, in the sensors' units, (S,)
+    errors: HeldOutErrors
+
+    @classmethod
+    def of(cls, state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...]) -> HeldOutRuns:
+        """The errors of two free runs of an investigation."""
+        noise = bounded(state, noisy)
+        floor = state.held.noise_rms(state.fit, noise)
+        errors = held_out_errors(before, after, floor, state.options.rules.verdict)
+        return cls(before, after, noisy, noise, floor, errors)
+
+
+def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgement:
     """Errors and verdict of an investigation.
 
-    before, after: free runs without and with the findings.  ended: the limit that ended the search, or empty.  If
-    laws act along the measured motion and the free run loses its phase, its errors are not informative; the verdict
-    is then based on the unmeasured forces relative to the inertia forces.
+    ended: the limit that ended the search, or empty.  If laws act along the measured motion and the free run loses its
+    phase, its errors are not informative; the verdict is then based on the unmeasured forces relative to the inertia
+    forces.
     """
-    rules = state.options.rules.verdict
-    noise = bounded(state, noisy)
-    floor = state.held.noise_rms(state.fit, noise)
-    errors = held_out_errors(before, after, floor, rules)
-    lost = state.problem.process_noise and after.nrmse > rules.rejected
-    deciding = _deciding_errors(state, errors, noise, lost=lost)
-    faults, physics = _kinds_of_faults(state, noisy), _kinds_of_physics(state)
+    rules, errors = state.options.rules.verdict, runs.errors
+    lost = state.problem.process_noise and runs.after.nrmse > rules.rejected
+    deciding = _deciding_errors(state, errors, runs.noise, lost=lost)
+    faults, physics = _kinds_of_faults(state, runs.noisy), _kinds_of_physics(state)
     other = another_structure(state, deciding)
     verdict = verdict_of(faults + physics, deciding, rules, other_structure=other, ended=bool(ended))
     error, unknown = float(np.sqrt(np.mean(deciding.after**2))), verdict == "unknown_physics"
@@ -48,7 +63,7 @@ def judged(
     return Judgement(
         errors=errors,
         verdict=verdict,
-        floor=floor,
+        floor=runs.floor,
         error=error,
         rejected=rejected,
         lost_phase=lost,
@@ -57,7 +72,7 @@ def judged(
         carried=_carries(verdict, physics),
         ended=ended,
         place=_place(state),
-        where=_words(state, errors, after),
+        where=_words(state, errors, runs.after),
     )
 
 
