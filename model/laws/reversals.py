@@ -110,15 +110,25 @@ def _functions(
         return math.atan, lambda x: math.tan(min(x, _BLOWS)), lambda x: np.tan(np.minimum(x, _BLOWS))
     u, way = _table(exponent, saturates)
     us, ways = u.tolist(), way.tolist()
-    return lambda v: _between(v, us, ways), lambda x: _between(x, ways, us), lambda x: np.interp(x, way, u)
+    return _interpolation(us, ways), _interpolation(ways, us), lambda x: np.interp(x, way, u)
 
 
-def _between(value: float, x: list[float], y: list[float]) -> float:
+def _interpolation(x: list[float], y: list[float]) -> Callable[[float], float]:
     """Linear interpolation of one number; quicker than through arrays.  Where x stands still, the last y."""
-    i = min(max(bisect_right(x, value), 1), len(x) - 1)
-    width = x[i] - x[i - 1]
-    share = (value - x[i - 1]) / width if width > 0 else 1.0
-    return y[i - 1] + min(max(share, 0.0), 1.0) * (y[i] - y[i - 1])
+    last = len(x) - 1
+
+    def between(value: float) -> float:
+        i = bisect_right(x, value, 1, last)
+        begin, low = x[i - 1], y[i - 1]
+        width = x[i] - begin
+        share = (value - begin) / width if width > 0 else 1.0
+        if share < 0:  # called for every reversal: comparisons, since min and max take as long as all the rest
+            share = 0.0
+        elif share > 1:
+            share = 1.0
+        return low + share * (y[i] - low)
+
+    return between
 
 
 def _table(exponent: float, saturates: bool) -> tuple[FloatArray, FloatArray]:
