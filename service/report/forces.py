@@ -40,7 +40,7 @@ def _running_median(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     return tuple(np.array(rows).T) if rows else (np.array([]),) * 4
 
 
-def residual_figure(report: Report, finding: int) -> Figure | None:
+def residual_figure(report: Report, finding: int, *, narrow: bool = False) -> Figure | None:
     """Force that the model misses over deflection and over rate, before and after."""
     d, v = _get(report, finding, "deflection"), _get(report, finding, "rate")
     before, after = _get(report, finding, "force_before"), _get(report, finding, "force_after")
@@ -49,8 +49,7 @@ def residual_figure(report: Report, finding: int) -> Figure | None:
     place = report.findings[finding].location
     stages = [("before", before, ink.BEFORE)] + ([("after", after, ink.AFTER)] if after is not None else [])
     with rc_context(ink.RC):
-        figure = ink.new_figure(10.5, 2.9 * len(stages))
-        grid = figure.subplots(len(stages), 2, squeeze=False, sharey=True, sharex="col")
+        figure, grid = ink.new_panels(len(stages), 2, 10.5, 2.9, narrow=narrow, sharey=True, sharex="col")
         top = float(np.nanquantile(np.abs(before), 0.999)) * 1.15 or 1.0
         scale, unit = _unit(np.array([top]), "N")
         for axes_row, (stage, force, colour) in zip(grid, stages, strict=True):
@@ -62,23 +61,24 @@ def residual_figure(report: Report, finding: int) -> Figure | None:
                 axes.plot(centre * factor, middle * scale, color=ink.MEASURED, lw=1.8)
                 axes.set_ylim(-top * scale, top * scale)
                 axes.set_title(f"missing force over {word}, {stage}")
-                axes.set_xlabel(f"{word} of {place} [{x_unit}]" if stage == stages[-1][0] else "")
-            axes_row[0].set_ylabel(f"force [{unit}]")
+                axes.set_xlabel(f"{word} of {place} [{x_unit}]" if narrow or stage == stages[-1][0] else "")
+            for axes in axes_row if narrow else axes_row[:1]:
+                axes.set_ylabel(f"force [{unit}]")
     return figure
 
 
-def force_figure(report: Report, finding: int) -> Figure | None:
+def force_figure(report: Report, finding: int, *, narrow: bool = False) -> Figure | None:
     """The restoring force found without a law, its band, and the law through it; a map where no law was named."""
     if _get(report, finding, "map_force") is not None and _get(report, finding, "curve_law") is None:
-        return _map_figure(report, finding)
+        return _map_figure(report, finding, narrow=narrow)
     x, mean = _get(report, finding, "curve_x"), _get(report, finding, "curve_mean")
     loop = _get(report, finding, "loop_x") is not None
     if (x is None or mean is None) and not loop:
         return None
     with rc_context(ink.RC):
         panels = int(x is not None and mean is not None) + int(loop)
-        figure = ink.new_figure(5.4 * panels, 3.7)
-        axes = list(figure.subplots(1, panels, squeeze=False)[0])
+        figure, grid = ink.new_panels(1, panels, 5.4 * panels, 3.7, narrow=narrow)
+        axes = list(grid[0])
         if x is not None and mean is not None:
             _curve_panel(axes[0], report, finding, x, mean)
         if loop:
@@ -124,14 +124,15 @@ def _loop_panel(axes: Axes, report: Report, finding: int) -> None:
     axes.set_title(f"{report.findings[finding].location}: loop")
 
 
-def _map_figure(report: Report, finding: int) -> Figure:
+def _map_figure(report: Report, finding: int, *, narrow: bool) -> Figure:
     found = {key: _get(report, finding, key) for key in ("map_d", "map_v", "map_force", "map_std")}
     d, v, force = found["map_d"], found["map_v"], found["map_force"]
     assert d is not None and v is not None and force is not None
     with rc_context(ink.RC):
         spread = found["map_std"]
-        figure = ink.new_figure(10.5 if spread is not None else 5.6, 3.9)
-        panels = list(figure.subplots(1, 2 if spread is not None else 1, squeeze=False)[0])
+        columns, width = (2, 10.5) if spread is not None else (1, 5.6)
+        figure, grid = ink.new_panels(1, columns, width, 3.9, narrow=narrow)
+        panels = list(grid[0])
         x_factor, x_unit = _unit(d, "m")
         y_factor, y_unit = _unit(v, "m/s")
         scale, unit = _unit(force, "N")

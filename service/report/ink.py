@@ -10,6 +10,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from sprung.model.signals import FloatArray
 
@@ -43,6 +44,7 @@ RC: Any = {
     "axes.spines.right": False,
 }
 DOTS_PER_INCH = 120
+NARROW = 4.4  # inches of a picture for phones: letters are then read at 350 pixels
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -51,6 +53,20 @@ def new_figure(width: float, height: float) -> Figure:
         figure = Figure(figsize=(width, height), layout="constrained", dpi=DOTS_PER_INCH)
         FigureCanvasAgg(figure)
     return figure
+
+
+def new_panels(
+    rows: int, columns: int, width: float, row_height: float, *, narrow: bool, **grid: Any
+) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure of so many panels and its axes (rows, columns), in inches; narrow: one below the other, for phones.
+
+    grid: further arguments of `Figure.subplots`, for panels beside each other.
+    """
+    if not narrow:
+        figure = new_figure(width, row_height * rows)
+        return figure, figure.subplots(rows, columns, squeeze=False, **grid)
+    figure = new_figure(NARROW, row_height * rows * columns)
+    return figure, figure.subplots(rows * columns, 1, squeeze=False).reshape(rows, columns)
 
 
 def save(figure: Figure, path: Path) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,11 @@ def inline(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
 
 
-def render(report: Report, pictures: Mapping[str, Path], laws: words.Laws) -> str:
-    """The page; pictures are keyed as `writing.draw_pictures` names them, laws are those that were tried."""
-    inside = {key: inline(path) for key, path in pictures.items()}
+def render(report: Report, pictures: Mapping[str, Path], narrow: Mapping[str, Path], laws: words.Laws) -> str:
+    """The page; pictures are keyed as `writing.draw_pictures` names them, laws are those that were tried.
+
+    narrow: those that are shown on phones instead.
+    """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=False)
     return environment.from_string((TEMPLATES / "report.html").read_text("utf-8")).render(
         report=report,
@@ -34,8 +36,9 @@ def render(report: Report, pictures: Mapping[str, Path], laws: words.Laws) -> st
         headline=words.headline(report, laws),
         style=Markup((TEMPLATES / "report.css").read_text("utf-8")),  # nosec B704: our own file
         back=Markup(BACK),  # nosec B704: a constant
-        pictures=inside,
-        groups=_groups(report, inside, laws),
+        pictures={key: inline(path) for key, path in pictures.items()},
+        narrow={key: inline(path) for key, path in narrow.items()},
+        groups=_groups(report, pictures, laws),
         rows=rows(report),
         named={(f.location, f.effect) for f in report.findings},
         effect=partial(words.effect_words, laws=laws),
@@ -45,19 +48,19 @@ def render(report: Report, pictures: Mapping[str, Path], laws: words.Laws) -> st
     )
 
 
-def _groups(report: Report, inside: Mapping[str, str], laws: words.Laws) -> list[dict[str, Any]]:
-    """The pictures of each finding, then the fit in time and frequency."""
+def _groups(report: Report, drawn: Collection[str], laws: words.Laws) -> list[dict[str, Any]]:
+    """The keys of the pictures of each finding, then the fit in time and frequency."""
     groups = []
     for number, finding in enumerate(report.findings):
-        own = [inside[key] for key in (f"force_{number}", f"residual_{number}") if key in inside]
+        own = [key for key in (f"force_{number}", f"residual_{number}") if key in drawn]
         if own:
             title = f"{finding.location}: {words.finding_words(finding, laws)}"
             groups.append({"title": title, "pictures": own, "note": ""})
-    if "fit" in inside:
+    if "fit" in drawn:
         groups.append(
             {
                 "title": "Measured against simulated, held-out part",
-                "pictures": [inside["fit"]],
+                "pictures": ["fit"],
                 "note": "Free-running: the simulation sees the measured inputs only.",
             }
         )

@@ -29,7 +29,9 @@ def _shown_sensors(measured: Array, baseline: Array, augmented: Array) -> list[i
     return sorted(int(i) for i in best)
 
 
-def fit_figure(report: Report, sensors: tuple[str, ...], units: tuple[str, ...], rate: float) -> Figure | None:
+def fit_figure(
+    report: Report, sensors: tuple[str, ...], units: tuple[str, ...], rate: float, *, narrow: bool = False
+) -> Figure | None:
     """Rows: sensors; left: an excerpt in time with its errors; right: spectra.  None without the arrays."""
     found = report.plot_data
     if "validation.measured" not in found or len(found["validation.measured"]) < 32:
@@ -40,17 +42,18 @@ def fit_figure(report: Report, sensors: tuple[str, ...], units: tuple[str, ...],
     rows = _shown_sensors(measured, baseline, augmented)
     noise = found.get("validation.noise")
     with rc_context(ink.RC):
-        figure = ink.new_figure(10.5, 2.75 * len(rows))
-        grid = figure.subplots(len(rows), 2, squeeze=False, gridspec_kw={"width_ratios": [1.45, 1]})
+        shares = {"width_ratios": [1.45, 1]}
+        figure, grid = ink.new_panels(len(rows), 2, 10.5, 2.75, narrow=narrow, gridspec_kw=shares)
         for row, (left, right) in zip(rows, grid, strict=True):
             columns = [a[:, row] for a in (measured, baseline, augmented)]
             _time_panel(left, time, columns, f"{sensors[row]}  [{_pretty(units[row])}]", bool(report.findings))
             floor = None if noise is None else float(noise[row])
             _spectrum_panel(right, columns, rate, units[row], floor, bool(report.findings))
         handles, labels = grid[0][1].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
-        grid[-1][0].set_xlabel("time [s]")
-        grid[-1][1].set_xlabel("frequency [Hz]")
+        figure.legend(handles, labels, loc="outside upper center", ncols=2 if narrow else 4, fontsize=9)
+        for left, right in grid if narrow else grid[-1:]:
+            left.set_xlabel("time [s]")
+            right.set_xlabel("frequency [Hz]")
     return figure
 
 

@@ -55,7 +55,7 @@ def largest_bias(report: Report) -> Row | None:
     return max(moved, key=lambda r: abs(r.bias or 0.0), default=None)
 
 
-def parameter_figure(report: Report) -> Figure | None:
+def parameter_figure(report: Report, *, narrow: bool = False) -> Figure | None:
     """Ratio to nominal of every parameter that has one, before and after, one panel per quantity."""
     every = [row for row in rows(report) if row.nominal]
     if not every:
@@ -63,8 +63,8 @@ def parameter_figure(report: Report) -> Figure | None:
     quantities = list(dict.fromkeys(r.name.rpartition(".")[2] for r in every))
     with rc_context(ink.RC):
         longest = max(sum(r.name.endswith(q) for r in every) for q in quantities)
-        figure = ink.new_figure(10.5, 0.26 * longest + 1.15)
-        panels = np.atleast_1d(figure.subplots(1, len(quantities)))
+        figure, grid = ink.new_panels(1, len(quantities), 10.5, 0.26 * longest + 1.15, narrow=narrow)
+        panels = grid[0]
         for number, (axes, quantity) in enumerate(zip(panels, quantities, strict=True)):
             mine = [r for r in every if r.name.endswith("." + quantity)][::-1]
             place = np.arange(len(mine))

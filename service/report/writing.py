@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from matplotlib.figure import Figure
 
@@ -35,18 +36,29 @@ def findings_by_place(findings: Sequence[Finding], laws: words.Laws) -> dict[str
 def draw_pictures(report: Report, system: System, folder: Path) -> dict[str, Path]:
     """Every picture for which the report has the arrays, as PNG files in `folder`."""
     findings = findings_by_place(report.findings, system.catalogue)
-    units = {channel.name: channel.unit for channel in system.channels}
-    figures: dict[str, Figure | None] = {
+    figures = {
         "system": drawing.draw_system(system, findings, report.localization),
-        "fit": signals.fit_figure(report, system.sensors, tuple(units[s] for s in system.sensors), system.sample_rate),
         "sensors": signals.sensor_figure(report),
         "locations": values.location_figure(report),
-        "parameters": values.parameter_figure(report),
+    }
+    return _saved(figures | _panelled(report, system, narrow=False), folder)
+
+
+def _panelled(report: Report, system: System, *, narrow: bool) -> dict[str, Figure | None]:
+    """The pictures of several panels; narrow: below each other, for phones."""
+    units = tuple(channel.unit for channel in system.channels[len(system.inputs) :])
+    figures = {
+        "fit": signals.fit_figure(report, system.sensors, units, system.sample_rate, narrow=narrow),
+        "parameters": values.parameter_figure(report, narrow=narrow),
     }
     for number in range(len(report.findings)):
-        figures[f"force_{number}"] = forces.force_figure(report, number)
-        figures[f"residual_{number}"] = forces.residual_figure(report, number)
-    return {key: ink.save(f, folder / f"{key}.png") for key, f in figures.items() if f is not None}
+        figures[f"force_{number}"] = forces.force_figure(report, number, narrow=narrow)
+        figures[f"residual_{number}"] = forces.residual_figure(report, number, narrow=narrow)
+    return figures
+
+
+def _saved(figures: Mapping[str, Figure | None], folder: Path) -> dict[str, Path]:
+    return {key: ink.save(figure, folder / f"{key}.png") for key, figure in figures.items() if figure is not None}
 
 
 def write_report(report: Report, system: System, folder: Path) -> ReportFiles:
@@ -62,7 +74,9 @@ def write_report(report: Report, system: System, folder: Path) -> ReportFiles:
     folder.mkdir(parents=True, exist_ok=True)
     pictures = draw_pictures(report, system, folder)
     page, data = folder / "report.html", folder / "report.json"
-    page.write_text(render(report, pictures, system.catalogue), encoding="utf-8")
+    with TemporaryDirectory() as kept:
+        narrow = _saved(_panelled(report, system, narrow=True), Path(kept))
+        page.write_text(render(report, pictures, narrow, system.catalogue), encoding="utf-8")
     data.write_text(json.dumps(report.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
     return ReportFiles(page, data, pictures)
 

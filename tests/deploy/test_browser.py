@@ -441,6 +441,12 @@ def test_a_report_is_read_on_a_phone_and_in_the_dark(report_page: Path, browser:
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     red = page.evaluate("Number(getComputedStyle(document.body).backgroundColor.match(/\\d+/)[0])")
     assert (red < 100) == (scheme == "dark")
+    sizes = page.evaluate(
+        "[...document.querySelectorAll('.picture')].map(p => [p.scrollWidth - p.clientWidth, !!p.closest('.drawing'),"
+        " p.querySelector('img').clientWidth / p.querySelector('img').naturalWidth])"
+    )
+    for beyond, drawing, shrunk in sizes:  # letters are drawn 16 pixels high
+        assert beyond <= 0 and (drawing or shrunk > 0.5)
     assert serious(page) == []
     kept(page, f"report-{width}-{scheme}")
     context.close()

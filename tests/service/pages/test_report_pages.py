@@ -25,9 +25,16 @@ from tests.report_made import SYSTEM, friction_report
 def test_the_page_needs_nothing_from_outside_and_holds_every_picture(tmp_path: Path) -> None:
     files = write_report(friction_report(), SYSTEM, tmp_path / "new" / "folder")
     page = files.page.read_text(encoding="utf-8")
-    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page)
+    assert not re.findall(r"""(?:src|srcset|href)=["'](?!data:)""", page)
     assert "http" not in page
-    assert page.count("data:image/png;base64,") == len(files.pictures)
+    assert page.count(' src="data:image/png;base64,') == len(files.pictures)
+    narrow = {"fit", "parameters", "force_0", "residual_0"}  # those of panels beside each other
+    assert page.count(' srcset="data:image/png;base64,') == len(narrow) and narrow < set(files.pictures)
+    assert {path.name for path in files.page.parent.iterdir()} == {
+        *(path.name for path in files.pictures.values()),
+        files.page.name,
+        files.data.name,
+    }
     expected = {"system", "fit", "sensors", "locations", "parameters", "force_0", "residual_0"}
     assert set(files.pictures) == expected
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in files.pictures.values())
