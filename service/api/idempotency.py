@@ -35,7 +35,11 @@ from sprung.service.times import NANOSECONDS
 
 T = TypeVar("T")
 KEPT = LONGEST_PAUSE + 86_400 * NANOSECONDS  # a day, though the host's clock leaps while the service is stopped
-Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=200, description="sent twice, carried out once")]
+Key = Annotated[
+    str | None,
+    # an empty one, as of a variable that was never set, would be that of all requests of a client
+    Header(alias="Idempotency-Key", min_length=1, max_length=200, description="sent twice, carried out once"),
+]
 
 
 class KeysAtWork:

@@ -12,6 +12,7 @@ from sprung.service.api.problems import ApiProblem, problem_response
 from sprung.service.api.scopes import content_kind
 
 CLOSE = {"Connection": "close"}
+DISCARDED = 8_000_000  # bytes that are taken of a refused body: a connection closed on what it holds loses its answer
 
 
 class BodyLimit:
@@ -33,6 +34,8 @@ class BodyLimit:
         detail = f"the body is longer than {limit} bytes"
         stated = headers.get("content-length", "")
         if stated.isdigit() and int(stated) > limit:
+            if int(stated) <= DISCARDED and "expect" not in headers:  # who asks first has not sent it
+                await _discard(receive)
             await problem_response(ApiProblem(413, detail, headers=CLOSE), scope["path"])(scope, receive, send)
             return
         received = 0
@@ -46,3 +49,9 @@ class BodyLimit:
             return message
 
         await self.app(scope, counted, send)
+
+
+async def _discard(receive: Receive) -> None:
+    """Take the body without keeping it; a client that stops sending is the server's to give up."""
+    while (await receive()).get("more_body", False):
+        pass

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Query
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
+from sprung.model.diagnosis.investigation.verdict import Verdict
 from sprung.service.api import job_models, models
 from sprung.service.api.access import CoreOf, read
 from sprung.service.api.answers import json_response
@@ -69,7 +70,7 @@ async def jobs(
 async def reports(
     core: CoreOf,
     vehicle: OfVehicle = None,
-    verdict: Annotated[str | None, Query(max_length=40)] = None,
+    verdict: Verdict | None = None,
     limit: Limit = 100,
     after: After = None,
 ) -> Response:

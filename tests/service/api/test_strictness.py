@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 from fastapi.testclient import TestClient
 from pydantic import BaseModel
+from starlette.types import Message, Receive, Scope, Send
 
 from sprung.service.api import models
+from sprung.service.api.limits import BodyLimit
 
 
 @pytest.mark.parametrize(
@@ -39,6 +43,8 @@ def test_a_wrong_method_is_told_the_right_ones(client: TestClient, method: str, 
         ("/reports?after=%D9%A3:a", "after"),
         ("/vehicles?after=99999999999999999999:a", "after"),
         ("/vehicles?q=%00", "q"),
+        ("/reports?verdict=missing_physic", "query.verdict"),
+        ("/reports?verdict=", "query.verdict"),
         ("/vehicles/a/history?parameter=primary_11l.stiffness&since=20&until=10", "until"),
         ("/vehicles/a/history?format=csv&since=20&until=20", "until"),
     ],
@@ -46,6 +52,47 @@ def test_a_wrong_method_is_told_the_right_ones(client: TestClient, method: str, 
 def test_a_wrong_query_is_refused(client: TestClient, path: str, field: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 422 and [error["field"] for error in answer.json()["errors"]] == [field]
+
+
+@pytest.mark.parametrize("key", ["", "k" * 201])
+def test_a_key_that_names_no_request_is_refused(client: TestClient, key: str) -> None:
+    """Two requests without a key of their own would be taken for one, and the second never carried out."""
+    for _ in range(2):
+        answer = client.post("/vehicles/a/notes", json={"text": "wheels turned"}, headers={"Idempotency-Key": key})
+        assert answer.status_code == 422
+        assert [error["field"] for error in answer.json()["errors"]] == ["header.Idempotency-Key"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "headers", "taken"),
+    [(3_000_000, [], True), (3_000_000, [(b"expect", b"100-continue")], False), (2_000_000_000, [], False)],
+)
+def test_a_body_past_the_limit_is_taken_before_it_is_refused(
+    stated: int, headers: list[tuple[bytes, bytes]], taken: bool
+) -> None:
+    """A connection that is closed on unread bytes is reset: the client would not see why."""
+    events: list[str] = []
+    pieces = iter(range(3))
+
+    async def receive() -> Message:
+        piece = next(pieces)
+        events.append("taken")
+        return {"type": "http.request", "body": b" " * 1_000_000, "more_body": piece < 2}
+
+    async def send(message: Message) -> None:
+        events.append(str(message.get("status", "body")))
+
+    async def inner(scope: Scope, receive: Receive, send: Send) -> None:
+        raise AssertionError
+
+    scope = {
+        "type": "http",
+        "method": "POST",
+        "path": "/identify",
+        "headers": [(b"content-length", str(stated).encode()), *headers],
+    }
+    asyncio.run(BodyLimit(inner, 2_000_000, {})(scope, receive, send))
+    assert events == [*(["taken"] * 3 if taken else []), "413", "body"]
 
 
 @pytest.mark.parametrize(("body", "said"), [(b'{"text":', "is no JSON"), (b"[]", "object"), (b"3", "object")])
