@@ -43,7 +43,14 @@ def write_recording(
         raise UnwritableRecording(f"{path}: cannot write files of this kind; known are {' '.join(sorted(WRITERS))}")
     recorded = (values - [c.offset for c in channels]) / [c.gain for c in channels]
     times = start + np.round(np.arange(len(values)) * 1e9 / sample_rate).astype(np.int64)
-    writer(path, channels, recorded, times, dbc, vehicle)
+    try:
+        writer(path, channels, recorded, times, dbc, vehicle)
+    except OSError as error:  # of a full disk it has no file's name
+        if path.is_file():
+            path.unlink()  # a part would be read as a whole ride
+        raise UnwritableRecording(
+            f"{path}: cannot be written whole ({error.strerror or error}); nothing is left"
+        ) from error
 
 
 def without_address(path: Path, channel: Channel) -> str | None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import re
+import resource
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ import sprung
 from sprung.model.laws import CLOCK_LEAD
 from sprung.model.simulate.begun import fitted_start
 from sprung.model.simulate.ride import SimulationError, simulate_ride, with_values
-from sprung.model.system import System, load_system, parse_system
+from sprung.model.system import MANCHESTER_DBC, System, load_system, parse_system
 from sprung.replay.auxiliary import AuxiliaryMeans
 from sprung.replay.record import load_record
 from sprung.replay.recording import open_recording
@@ -183,6 +185,22 @@ def test_a_recording_of_another_kind_is_refused(tmp_path: Path) -> None:
         write_recording(tmp_path / "a.xlsx", [], np.zeros((1, 0)), 1.0, 0)
     with pytest.raises(UnwritableRecording, match="database"):
         write_recording(tmp_path / "a.blf", load_system().channels, np.zeros((1, 28)), 1.0, 0)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".mcap", ".blf", ".asc", ".log"])
+def test_what_a_full_disk_cuts_off_is_told_and_removed(suffix: str, tmp_path: Path) -> None:
+    vehicle = load_system()
+    path, values = tmp_path / f"ride{suffix}", np.zeros((3000, len(vehicle.channels)))
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, usual[1]))
+        with pytest.raises(UnwritableRecording, match=rf"ride{suffix}: cannot be written whole \(File too large\)"):
+            write_recording(path, vehicle.channels, values, 100.0, 0, dbc=MANCHESTER_DBC)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not path.exists()
 
 
 def test_simulate_then_compare_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
