@@ -18,7 +18,7 @@ from sprung.replay.skeleton import skeleton
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.console import print_table
-from sprung.service.cli.targets import check_file
+from sprung.service.cli.targets import check_file, written_whole
 from sprung.service.errors import UserError
 from sprung.service.sources.loading import InspectionRequest
 from sprung.service.times import to_iso
@@ -76,7 +76,8 @@ def _time(
 def _write(path: Path, text: str) -> None:
     if path.exists():
         raise UserError(f"{path}: exists already; --write-system writes new files only")
-    path.write_text(text, encoding="utf-8")
+    with written_whole(path):
+        path.write_text(text, encoding="utf-8")
 
 
 def as_dict(found: Inspection) -> dict[str, object]:
