@@ -489,6 +489,12 @@ class ComponentRules:
     another_curve: float = rule(
         0.5, "of what a sum of curves leaves, left beside one more; chosen: most of it", 0.3, 0.7
     )
+    imitated: float = rule(
+        0.005, "of the excess power, that laws may leave as a force of the motion; chosen: 7 % of a force", 0.002, 0.02
+    )
+    another_force: float = rule(
+        0.5, "of what laws leave, left beside an unnamed force that they lack; chosen: most of it", 0.3, 0.7
+    )
     formula_reach: float = rule(20.0, "times the usual size of a length or rate, either way; chosen", 10.0, 40.0)
     formula_partners: int = rule(3, "shapes of a formula that others are tried beside; chosen", 2, 5)
     formula_significant: float = rule(5.0, "deviations of an amplitude; derived: one in a million", 3.0, 8.0)

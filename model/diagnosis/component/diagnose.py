@@ -10,6 +10,7 @@ import numpy as np
 from sprung.model.diagnosis.component.compose import compose_components
 from sprung.model.diagnosis.component.drifting import drifts, possible_drift
 from sprung.model.diagnosis.component.formula import formula_search
+from sprung.model.diagnosis.component.imitated import imitates
 from sprung.model.diagnosis.component.judgement import JudgedComponent, concluded
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
 from sprung.model.diagnosis.component.smooth import smooth_serves
@@ -129,6 +130,8 @@ def _doubtful(judged: JudgedComponent, rules: VerdictRules) -> bool:
     if np.any(judged.errors.unexplained(rules) > 0) and not carried:
         return True
     if steps and (judged.errors.outweigh_findings(rules) or judged.errors.reject(rules)):
+        return True
+    if steps and imitates(judged.final, judged.base):
         return True
     return bool(_undetermined(judged)) or smooth_serves(judged.final, len(judged.record.given.pieces))
 
