@@ -18,10 +18,10 @@ def imitates(fit: ComponentFit, base: ComponentFit) -> bool:
     It counts if it is a visible share of what that model leaves, in either part of the record, and if the held-out part
     does not refute it.
     """
-    task, rules, noise = fit.task, fit.task.rules, fit.floor**2
+    task, rules = fit.task, fit.task.rules
     if not fit.leaves_more or task.motion.repeats(rules):
         return False
-    beside = fitted(task, fit.model.plus(SURFACE, ()))
+    noise, beside = fit.floor**2, fitted(task, fit.model.plus(SURFACE, ()))
     if beside.held_out > max(fit.held_out, rules.above * noise):
         return False
     gain = level_gain(fit.error, beside.error, effective_count(fit.residual[: task.split]))

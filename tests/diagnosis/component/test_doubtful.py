@@ -17,14 +17,17 @@ DAHL = next(piece for piece in PIECES if piece.effect == "dahl")
 
 
 def judged(before: float, after: float) -> Any:
-    """One law on a record, with errors over the deviation of the force; a floor of 0.001."""
-    step = SimpleNamespace(piece=DAHL)
+    """One law on a record of one loop, with errors over the deviation of the force; a floor of 0.001."""
+    step, motion = SimpleNamespace(piece=DAHL), SimpleNamespace(repeats=lambda rules: True)
     return SimpleNamespace(
         errors=HeldOutErrors(np.array([before]), np.array([after]), np.array([1e-3])),
         found=SimpleNamespace(steps=(step,)),
         final=SimpleNamespace(
-            task=SimpleNamespace(rules=RULES.component), model=SimpleNamespace(pieces=(DAHL,)), leaves_more=True
+            task=SimpleNamespace(rules=RULES.component, motion=motion),
+            model=SimpleNamespace(pieces=(DAHL,)),
+            leaves_more=True,
         ),
+        base=None,
         record=SimpleNamespace(given=SimpleNamespace(pieces=())),
     )
 
