@@ -495,6 +495,11 @@ class ComponentRules:
     another_force: float = rule(
         0.5, "of what laws leave, left beside an unnamed force that they lack; chosen: most of it", 0.3, 0.7
     )
+    spikes: int = rule(20, "single values of a channel that are left out; chosen: more are no exception", 10, 50)
+    spike: float = rule(
+        4.0, "times what is left between neighbours, that such a value is off; derived: a step leaves a third", 3.2, 6.0
+    )
+    spike_noise: float = rule(8.0, "deviations of the noise that it is off; derived: never by chance", 6.0, 12.0)
     formula_reach: float = rule(20.0, "times the usual size of a length or rate, either way; chosen", 10.0, 40.0)
     formula_partners: int = rule(3, "shapes of a formula that others are tried beside; chosen", 2, 5)
     formula_significant: float = rule(5.0, "deviations of an amplitude; derived: one in a million", 3.0, 8.0)

@@ -53,6 +53,7 @@ def compose_components(
     words = "; ".join(leftover_words(j.record.element, j.final, j.size) for j, x in zip(judged, left, strict=True) if x)
     unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), words)
     advice = [note for j in judged for note in j.record.notes]
+    left_out = dict.fromkeys(f"{words}." for j in judged for words in j.record.left_out)  # of channels that some share
     return Report(
         system=system.name,
         recording=RecordingFacts(
@@ -73,7 +74,7 @@ def compose_components(
         laws=tuple(law for j in judged for law in _laws(j)),
         noise={j.record.sensor: j.record.task.noise for j in judged if j.record.task.noise > 0},
         unexplained=unexplained,
-        summary=_summary(judgement, findings, unexplained),
+        summary=" ".join((_summary(judgement, findings, unexplained), *left_out)),
         advice=tuple(advice if judgement.verdict != "consistent" else []),
         plot_data=_arrays(judged),
     )

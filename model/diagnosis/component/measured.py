@@ -14,6 +14,7 @@ import numpy as np
 from sprung.model.diagnosis.component.given import given_model
 from sprung.model.diagnosis.component.integrated import integrated, without_slow
 from sprung.model.diagnosis.component.own import observed, own_pieces
+from sprung.model.diagnosis.component.spikes import without_spikes
 from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentModel, ComponentTask, NominalValues
 from sprung.model.diagnosis.force.motion import (
     element_motion,
@@ -31,6 +32,8 @@ from sprung.model.schema import GROUND, ElementSensor, Sensor, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
+_TOLD = 5  # times of single wrong values that are listed
+
 
 @dataclass(frozen=True)
 class ComponentRecord:
@@ -42,6 +45,7 @@ class ComponentRecord:
     notes: tuple[str, ...]
     given: ComponentModel = NO_LAWS  # laws of the system file
     own: tuple[Piece, ...] = ()  # user-defined laws of the search
+    left_out: tuple[str, ...] = ()  # single wrong values of the channels, in words
 
 
 @dataclass(frozen=True)
@@ -169,7 +173,24 @@ def _record(
         held=held,
         delay_std=min(_delay_std(system, sensor), 1 / sample_rate),
     )
-    return ComponentRecord(element, sensor, task, tuple(notes), given, own)
+    left_out = _left_out(system, values, sample_rate, element, sensor)
+    return ComponentRecord(element, sensor, task, tuple(notes), given, own, left_out)
+
+
+def _left_out(system: System, values: FloatArray, sample_rate: float, element: str, sensor: str) -> tuple[str, ...]:
+    """Single wrong values of the channels of a component test that are left out, in words."""
+    names, ends = [channel.name for channel in system.channels], system.file.elements[element]
+    of_ends = [name for name in names if name.split(".")[0] in {ends.upper, ends.lower} & set(system.file.inputs)]
+    told = []
+    for name in (sensor, *of_ends):
+        _, at = without_spikes(values[:, names.index(name)])
+        if len(at):
+            times = ", ".join(f"{index / sample_rate:.2f}" for index in at[:_TOLD])
+            what = "a single value" if len(at) == 1 else f"{len(at)} single values"
+            verb, left = ("stands", "was") if len(at) == 1 else ("stand", "were")
+            more = " and later" if len(at) > _TOLD else ""
+            told.append(f"{name}: {what}, at {times} s{more}, {verb} out from all other changes and {left} left out")
+    return tuple(told)
 
 
 def _noise(measured: _Measured, rests: list[slice], run: slice, cell: Sensor, rules: Rules) -> tuple[float, float]:
@@ -323,10 +344,11 @@ def _fixed(system: System, element: str, quantity: str) -> float | None:
 
 
 def _column(values: FloatArray, names: list[str], name: str) -> FloatArray:
+    """A channel (T,) without its single wrong values."""
     series = np.array(values[:, names.index(name)], dtype=float)
     if not np.isfinite(series).any():
         raise DiagnosisError(f"channel {name} has no data in the recording")
-    return series
+    return without_spikes(series)[0]
 
 
 def _integral(rate: FloatArray, sample_rate: float) -> FloatArray:
