@@ -15,6 +15,7 @@ from mcap.writer import Writer
 
 from sprung.model.signals import Channel, FloatArray
 from sprung.replay.candatabase import load_database
+from sprung.replay.whole_file import written_whole
 
 
 class UnwritableRecording(ValueError):
@@ -44,13 +45,10 @@ def write_recording(
     recorded = (values - [c.offset for c in channels]) / [c.gain for c in channels]
     times = start + np.round(np.arange(len(values)) * 1e9 / sample_rate).astype(np.int64)
     try:
-        writer(path, channels, recorded, times, dbc, vehicle)
-    except OSError as error:  # of a full disk it has no file's name
-        if path.is_file():
-            path.unlink()  # a part would be read as a whole ride
-        raise UnwritableRecording(
-            f"{path}: cannot be written whole ({error.strerror or error}); nothing is left"
-        ) from error
+        with written_whole(path) as part:  # which would be read as a whole ride
+            writer(part, channels, recorded, times, dbc, vehicle)
+    except OSError as error:
+        raise UnwritableRecording(f"{path}: {error.strerror}") from error
 
 
 def without_address(path: Path, channel: Channel) -> str | None:

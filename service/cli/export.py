@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from sprung.model.exchange.fmu import write_fmu
@@ -13,6 +14,7 @@ from sprung.model.laws.in_place import is_linear
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.system import System
 from sprung.model.systemfile import written
+from sprung.replay.whole_file import written_whole
 
 REACH = 0.05, 1.0  # m and m/s up to which tables go
 
@@ -23,22 +25,28 @@ def export(system: System, out: Path) -> list[Path]:
         raise ExchangeError(f"{out}: there is no folder {out.parent} to write it to")
     if out.suffix and out.is_dir():
         raise ExchangeError(f"{out}: is a folder; a file is to be written")
-    match out.suffix.lower():
-        case ".mat":
-            write_mat(out, state_space(system))
-        case ".npz":
-            write_npz(out, state_space(system))
-        case ".mo":
-            write_modelica(out, system)
-        case ".fmu":
-            write_fmu(out, system)
-        case ".yaml" | ".yml":
-            out.write_text(written(system.file), encoding="utf-8")
-        case "":
-            return write_tables(out, system, *REACH)
-        case other:
-            raise ExchangeError(f"{out}: no format is called {other}; known are .mat .npz .mo .fmu .yaml, or a folder")
+    kind = out.suffix.lower()
+    if not kind:
+        return write_tables(out, system, *REACH)
+    if kind not in _WRITERS:
+        raise ExchangeError(f"{out}: no format is called {kind}; known are .mat .npz .mo .fmu .yaml, or a folder")
+    with written_whole(out) as part:
+        _WRITERS[kind](part, system)
     return [out]
+
+
+def _write_system_file(out: Path, system: System) -> None:
+    out.write_text(written(system.file), encoding="utf-8")
+
+
+_WRITERS: dict[str, Callable[[Path, System], None]] = {
+    ".mat": lambda out, system: write_mat(out, state_space(system)),
+    ".npz": lambda out, system: write_npz(out, state_space(system)),
+    ".mo": write_modelica,
+    ".fmu": write_fmu,
+    ".yaml": _write_system_file,
+    ".yml": _write_system_file,
+}
 
 
 def left_out(system: System, out: Path) -> list[str]:

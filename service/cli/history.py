@@ -7,8 +7,9 @@ from contextlib import closing
 from pathlib import Path
 
 from sprung.model.text import counted
+from sprung.replay.whole_file import written_whole
 from sprung.service.cli.options import time_of
-from sprung.service.cli.targets import check_file, written_whole
+from sprung.service.cli.targets import check_file
 from sprung.service.errors import UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
 from sprung.service.monitoring.engine import Engine, load_engine
@@ -51,8 +52,8 @@ def run(
         sys.stdout.buffer.write(body)
         sys.stdout.buffer.flush()
     else:
-        with written_whole(out):
-            out.write_bytes(body)
+        with written_whole(out) as part:
+            part.write_bytes(body)
         print(
             f"{out}: {counted(len(found.time), 'point')} of {counted(len(parameters or known), 'parameter')}",
             file=sys.stderr,

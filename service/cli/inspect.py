@@ -15,10 +15,11 @@ from sprung.model.text import escaped
 from sprung.model.units import FACTORS, known
 from sprung.replay.inspection import Inspection, Signal
 from sprung.replay.skeleton import skeleton
+from sprung.replay.whole_file import written_whole
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.console import print_table
-from sprung.service.cli.targets import check_file, written_whole
+from sprung.service.cli.targets import check_file
 from sprung.service.errors import UserError
 from sprung.service.sources.loading import InspectionRequest
 from sprung.service.times import to_iso
@@ -76,8 +77,8 @@ def _time(
 def _write(path: Path, text: str) -> None:
     if path.exists():
         raise UserError(f"{path}: exists already; --write-system writes new files only")
-    with written_whole(path):
-        path.write_text(text, encoding="utf-8")
+    with written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def as_dict(found: Inspection) -> dict[str, object]:

@@ -19,6 +19,7 @@ from sprung.model.schema import ForceInput
 from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.systemfile import json_schema
 from sprung.model.text import counted
+from sprung.replay.whole_file import written_whole
 from sprung.service.cli.export import export, left_out
 from sprung.service.cli.targets import check_file
 from sprung.service.rendering.render import quantity
@@ -31,7 +32,8 @@ def import_matrices(file: Path, out: Path, rate: float | None, name: str | None)
     check_file(out)
     text = read_matrices(file, name, rate)
     system = parse_system(text, str(out))
-    out.write_text(text, encoding="utf-8")
+    with written_whole(out) as part:
+        part.write_text(text, encoding="utf-8")
     print(
         f"{out}: {counted(len(system.bodies), 'body', 'bodies')}, {counted(len(system.elements), 'element')}, "
         f"{counted(len(system.sensors), 'sensor')}; "

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from sprung.service.errors import UserError
@@ -33,17 +31,6 @@ def check_folder(path: Path | None) -> None:
     if not there.is_dir():
         raise UserError(f"{path}: {'is' if there == path else f'{there} is'} a file; a folder is needed")
     _try(there, path)
-
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[None]:
-    """While a file is written: what a full disk leaves of it is removed.  Raises UserError with the file's name."""
-    try:
-        yield
-    except OSError as error:
-        if path.is_file():
-            path.unlink()
-        raise UserError(f"{path}: cannot be written whole ({error.strerror or error}); nothing is left") from error
 
 
 def _try(folder: Path, wanted: Path) -> None:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from sprung.model.signals import FloatArray
+from sprung.replay.whole_file import written_whole
 
 MEASURED = "#22303c"
 BEFORE = "#d1495b"  # nominal structure
@@ -71,8 +72,8 @@ def new_panels(
 
 def save(figure: Figure, path: Path) -> Path:
     """The figure as PNG at `path`."""
-    with rc_context(RC):
-        figure.savefig(path, dpi=DOTS_PER_INCH)
+    with rc_context(RC), written_whole(path) as part:
+        figure.savefig(part, dpi=DOTS_PER_INCH)
     return path
 
 

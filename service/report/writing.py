@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from sprung.model.diagnosis.report.report import Finding, Report
 from sprung.model.system import System
+from sprung.replay.whole_file import written_whole
 from sprung.service.report import drawing, forces, ink, signals, values, words
 from sprung.service.report.page import render
 
@@ -76,8 +77,10 @@ def write_report(report: Report, system: System, folder: Path) -> ReportFiles:
     page, data = folder / "report.html", folder / "report.json"
     with TemporaryDirectory() as kept:
         narrow = _saved(_panelled(report, system, narrow=True), Path(kept))
-        page.write_text(render(report, pictures, narrow, system.catalogue), encoding="utf-8")
-    data.write_text(json.dumps(report.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
+        with written_whole(page) as part:
+            part.write_text(render(report, pictures, narrow, system.catalogue), encoding="utf-8")
+    with written_whole(data) as part:
+        part.write_text(json.dumps(report.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
     return ReportFiles(page, data, pictures)
 
 

@@ -8,7 +8,6 @@ import json
 import math
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -32,8 +31,6 @@ from sprung.service.cli.diagnose import text as text_of
 from sprung.service.cli.doctor import _bus
 from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.replay import incomplete_line, measurement_lines, reporting_what_is_kept, slower_line
-from sprung.service.cli.targets import written_whole
-from sprung.service.errors import UserError
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.views import vehicle_view
 from sprung.service.rendering.render import percent
@@ -307,20 +304,6 @@ def test_export_of_an_unknown_vehicle_is_refused(tmp_path: Path, capsys: pytest.
     assert "nothing is known of vehicle 'nobody'" in capsys.readouterr().err
     assert main(["export", "a", "--format", "xls"]) == 2
     assert main(["export", "a", "--since", "noon", "--store", str(tmp_path / "s.db")]) == 2
-
-
-def test_a_file_that_a_full_disk_cuts_off_is_named_and_removed(tmp_path: Path) -> None:
-    usual, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    path = tmp_path / "history.csv"
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, usual[1]))
-        told = r"history.csv: cannot be written whole \(File too large\)"
-        with pytest.raises(UserError, match=told), written_whole(path):
-            path.write_bytes(b"1,2\n" * 10_000)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
-        signal.signal(signal.SIGXFSZ, handler)
-    assert not path.exists()
 
 
 @pytest.mark.slow
