@@ -1,9 +1,9 @@
 """`sprung bench paper [TASK]`: every table row and figure of the paper, from nothing, beside the paper's values.
 
-Tasks: the three visual systems, one of them with a wrong opening, their baselines tuned, the train with constant, changing and drifting
-parameters, the kernels of Fig. 3, the experiments on phases and on features, and what a window tells.  Checkpoints lie
-under `--out` (`runs/paper`, not kept in the repository): a command that was stopped, or that ran out of `--minutes`,
-goes on where it was when it is given again.
+Tasks: the three visual systems, one of them with a wrong opening, their baselines tuned, the train with constant,
+changing and drifting parameters, the kernels of Fig. 3, the experiments on phases and on features, and what a window
+tells.  Checkpoints lie under `--out` (`runs/paper`, not kept in the repository): a command that was stopped, or that
+ran out of `--minutes`, goes on where it was when it is given again.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class _SeedData:
 
 
 def rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
-    """The trials of each task and method, with the first seed; the best one on the seed, where it beats ALPS's settings."""
+    """The trials of each task and method, with seed 0; the best on the seed, where it beats the settings of ALPS."""
     for task in TASKS:
         for method in filter(settings.wants, METHODS):
             trials = list(_trials(task, method, settings))

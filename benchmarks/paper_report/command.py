@@ -11,7 +11,7 @@ from sprung.benchmarks.paper_report.kept import ARCHIVE, opened
 from sprung.service.errors import UserError
 
 PLACES = {  # kinds of places by the set of kept rows that they are written from
-    "core": ("rows", "explained", "against", "printed", "noisy", "poor", "compared", "targets"),
+    "core": ("rows", "explained", "against", "printed", "noisy", "poor", "tuned", "compared", "targets"),
     "variants": ("variants",),
 }
 

@@ -22,6 +22,7 @@ from sprung.benchmarks.paper_report.comparisons import (
 )
 from sprung.benchmarks.paper_report.tables import explained_table, name_of, seeds_of, table
 from sprung.benchmarks.paper_report.targets import targets
+from sprung.benchmarks.paper_report.tuned import tuned_table
 from sprung.benchmarks.paper_settings import EXTRA
 from sprung.benchmarks.paper_sources import is_current
 
@@ -151,6 +152,15 @@ def _poor_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     return comparisons_of_names(rows, task, pairs) or before.strip("\n")
 
 
+def _tuned_place(task: str, rows: Rows, folder: Path, before: str) -> str:
+    """The baselines with settings searched for them: the search, and ALPS's seeds with what it found."""
+    del task, folder
+    tuned = [row for row in rows if row["task"] == "tuning"]
+    if not tuned:
+        return before.strip("\n")
+    return f"{tuned_table(rows)}\n\n{_made(tuned)}"
+
+
 def _compared_place(task: str, rows: Rows, folder: Path, before: str) -> str:
     """Methods of the train against each other: their errors by trajectory are not kept, so that seeds are compared."""
     del folder
@@ -186,6 +196,7 @@ KINDS: dict[str, Callable[[str, Rows, Path, str], str]] = {
     "printed": _printed_place,
     "noisy": _noisy_place,
     "poor": _poor_place,
+    "tuned": _tuned_place,
     "compared": _compared_place,
     "targets": _targets_place,
     "variants": _variants_place,
