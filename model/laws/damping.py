@@ -267,6 +267,7 @@ def _typical_at_unit_rate(seen: Observed) -> float:
     return 0.3 * seen.damping * float(np.sqrt(max(seen.rate_rms, 1e-12)))
 
 
+_ORIFICES = (0.15, float("inf"))  # exponents that are made (Constantinou and Symans 1993); below them it is friction
 _EXPONENT, _LEFT = 0.4, 0.05  # to begin with; of the damper that was read, beside it
 
 
@@ -286,7 +287,9 @@ POWER_LAW_DAMPING = ElementLaw(
     title="damping with a power of the rate",
     parameters=(
         ParameterSpec("force", "N", 0.0, 1e12, "force at 1 m/s", _typical_at_unit_rate),
-        ParameterSpec("exponent", "1", 0.1, 0.95, "of the rate: 1 is a linear damper", lambda seen: 0.5),
+        ParameterSpec(
+            "exponent", "1", 0.1, 0.95, "of the rate: 1 is a linear damper", lambda seen: 0.5, plausible=_ORIFICES
+        ),
         replace(SMOOTHING, meaning="rate below which the force is linear"),
     ),
     force=_power,

@@ -174,3 +174,12 @@ def test_no_body_bends_far_below_its_motion_on_springs(frequency: float, doubted
     law = find_law("flexible_mode")
     values = tuple(frequency if name == "frequency" else 0.05 for name in law.names)
     assert (doubt(fit, Term(law, "car", values)) is not None) == doubted
+
+
+@pytest.mark.parametrize(("exponent", "doubted"), [(0.1, True), (0.14, True), (0.2, False), (0.9, False)])
+def test_a_fluid_damper_whose_force_hardly_grows_with_the_rate_is_friction(exponent: float, doubted: bool) -> None:
+    law = find_law("power_law_damping")
+    term = Term(law, "strut", (30.0, exponent, 1e-5), scales=(30.0, 0.5, 1e-5))
+    reason = out_of_range(term)
+    assert (reason is not None) is doubted
+    assert reason is None or reason.startswith(f"exponent {exponent:g} lies outside 0.15")
