@@ -17,8 +17,9 @@ from typing import Any
 from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps import evaluate, mass_spring_damper, metrics, pendulum, two_body
 from sprung.model.alps.config import RECIPES, NetworkConfig, TrainingConfig, for_recipe, training_config
-from sprung.model.alps.fit import Split, embedded, train_frames, train_method
+from sprung.model.alps.fit import Split, VisualModel, embedded, train_frames, train_method
 from sprung.model.alps.frames import FrameAutoencoder
+from sprung.model.alps.posterior import DivergedTraining
 from sprung.model.alps.task import Task
 
 TASKS = (pendulum.TASK, mass_spring_damper.TASK, two_body.TASK)
@@ -80,7 +81,9 @@ def rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
             trials = list(_trials(task, method, settings))
             if settings.seed == 0:
                 yield from trials
-            best = min(trials, key=lambda row: float(row["SE_affine"]))["trial"]
+            best = min((row for row in trials if "diverged" not in row), key=lambda row: float(row["SE_affine"]))[
+                "trial"
+            ]
             if best != AS_ALPS:
                 yield _row(task, method, best, settings, settings.seed, f"{task.name} {method} tuned")
 
@@ -96,26 +99,34 @@ def _trials(task: Task, method: str, settings: PaperSettings) -> Iterator[dict[s
 
 
 def _row(task: Task, method: str, trial: str, settings: PaperSettings, seed: int, name: str) -> dict[str, Any]:
-    """A method trained with the settings of a trial: SE after the affine map, over every test window."""
+    """A method trained with the settings of a trial: SE after the affine map, or that the training has diverged."""
     begin = time.process_time()
     data = _data(task, settings, seed)
     config = TRIALS[method][trial](data.config)
     folder = _made(settings.folder / task.name / trial.replace(" ", "-"))
-    model = train_method(
-        task, method, data.train, data.frames, config, NetworkConfig(), folder, settings.clock, settings.device
-    )
+    try:
+        model = train_method(
+            task, method, data.train, data.frames, config, NetworkConfig(), folder, settings.clock, settings.device
+        )
+        figures = _figures(task, model, data)
+    except DivergedTraining as diverged:
+        figures = {"diverged": str(diverged)}
+    return {
+        "task": settings.task, "method": name, **figures, "trial": trial, "seed": seed, "budget": settings.budget,
+        "settings": asdict(for_recipe(config, RECIPES[method])) | asdict(RECIPES[method]),
+        "processor_seconds": round(time.process_time() - begin, 1),
+    }  # fmt: skip
+
+
+def _figures(task: Task, model: VisualModel, data: _SeedData) -> dict[str, Any]:
+    """SE after an affine map fitted on training windows, over every test window."""
     affine = evaluate.gauge(task, model, data.train)
     found = evaluate.predict(model, data.test, *evaluate.every_window(data.test), affine)
     figures = {
         "SE_affine": metrics.state_error(task, found.simulated, found.true),
         "SE_affine_relative": metrics.relative_state_error(task, found.simulated, found.true),
     }
-    return {
-        "task": settings.task, "method": name, **{key: float(f"{value:.4g}") for key, value in figures.items()},
-        "trial": trial, "seed": seed, "budget": settings.budget,
-        "settings": asdict(for_recipe(config, RECIPES[method])) | asdict(RECIPES[method]),
-        "processor_seconds": round(time.process_time() - begin, 1),
-    }  # fmt: skip
+    return {key: float(f"{value:.4g}") for key, value in figures.items()}
 
 
 def _data(task: Task, settings: PaperSettings, seed: int) -> _SeedData:

@@ -25,7 +25,8 @@ def tuned_table(rows: Rows) -> str:
     lines = head("task", "method", "search", "tuned over untuned", "tuned over alps", "of each seed", "p, seeds")
     for task in TASKS:
         for method in METHODS:
-            trials = {r["trial"]: float(r[FIGURE]) for r in searched if r["method"] == f"{task} {method}, {r['trial']}"}
+            own = [row for row in searched if row["method"] == f"{task} {method}, {row['trial']}"]
+            trials = {row["trial"]: float(row.get(FIGURE, "inf")) for row in own}  # inf: it diverged
             if not trials:
                 continue
             search = ", ".join(f"{name} {se / trials[AS_ALPS]:.3g}" for name, se in trials.items() if name != AS_ALPS)
@@ -42,4 +43,6 @@ def _over(rows: Rows, task: str, method: str, searched: Rows) -> tuple[str, str,
         return "-", "-", "-", "-"
     p = "-" if to_alps.p_seeds is None else f"{to_alps.p_seeds:.2g}"
     each = ", ".join(f"{ratio:.3g}" for ratio in to_alps.by_seed)
+    lost = [str(row["seed"]) for row in best if "diverged" in row]
+    each += f"; diverged on seed {', '.join(lost)}" if lost else ""
     return f"{to_itself.ratio:.3g}", f"{to_alps.ratio:.3g}", each, p

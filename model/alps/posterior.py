@@ -19,6 +19,10 @@ _NODES, _WEIGHTS = (torch.from_numpy(v) for v in np.polynomial.legendre.leggauss
 MAX_CONCENTRATION = 1e4  # a draw 0.01 rad wide; keeps exp(k) scaled functions accurate
 
 
+class DivergedTraining(ValueError):
+    """Weights that are no numbers any more; one line."""
+
+
 def gaussian_sample(mean: Tensor, log_std: Tensor) -> Tensor:
     """Reparameterised draw of N(mean, exp(log_std)^2), any shape."""
     return mean + torch.exp(log_std) * torch.randn_like(mean)
@@ -74,7 +78,9 @@ class _Deviation(torch.autograd.Function):
 
 
 def _best_fisher(concentration: Tensor) -> Tensor:
-    """Draws of vM(0, k), float64, by rejection from a wrapped Cauchy envelope."""
+    """Draws of vM(0, k), float64, by rejection from a wrapped Cauchy envelope.  Errors: `DivergedTraining`."""
+    if not bool(torch.isfinite(concentration).all()):  # of which no draw would ever be accepted
+        raise DivergedTraining("a posterior is no number any more: the training has diverged; lower its rates")
     k = concentration.clamp(1e-4, MAX_CONCENTRATION)
     tau = 1 + torch.sqrt(1 + 4 * k * k)
     rho = (tau - torch.sqrt(2 * tau)) / (2 * k)

@@ -19,6 +19,7 @@ from sprung.model.alps.estimator import AlpsEstimator, log_magnitudes
 from sprung.model.alps.losses import loss_of
 from sprung.model.alps.network import Network
 from sprung.model.alps.posterior import (
+    DivergedTraining,
     gaussian_divergence,
     gaussian_sample,
     von_mises_divergence,
@@ -29,6 +30,12 @@ from sprung.model.alps.task import WINDOW, Task
 TASKS = [pendulum.TASK, mass_spring_damper.TASK, two_body.TASK]
 SIZES = NetworkConfig()
 KINDS = ("alps", "no_fourier", "no_attention", "autoencoder", "cdm", "hamiltonian", "decoder_free")
+
+
+def test_a_posterior_that_is_no_number_ends_the_training_instead_of_drawing_for_ever() -> None:
+    k = torch.tensor([1.0, float("nan"), 3.0], dtype=torch.float64)
+    with pytest.raises(DivergedTraining, match="has diverged"):
+        von_mises_sample(torch.zeros_like(k), k)
 
 
 @pytest.mark.parametrize("concentration", [0.3, 2.0, 30.0])

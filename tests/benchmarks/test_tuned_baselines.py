@@ -63,9 +63,11 @@ def test_the_page_holds_what_was_found_against_the_baseline_and_against_alps() -
         *(row("pendulum", "alps", 2.0, seed) for seed in (0, 1)),
         row("tuning", "two_body cdm, as alps", 4.0, 5, "as alps"),
         row("tuning", "two_body cdm, rates x 0.4", 6.0, 5, "rates x 0.4"),
+        {"task": "tuning", "method": "pendulum cdm tuned", "trial": "rates x 0.4", "seed": 2, "diverged": "lower"},
+        {"task": "tuning", "method": "two_body cdm, rates x 2.5", "trial": "rates x 2.5", "seed": 5, "diverged": "x"},
     ]
     lines = tuned_table(rows).splitlines()[2:]
     assert lines == [
-        "| pendulum | cdm | rates x 0.4 0.5 | 0.5 | 2 | 1.5, 2.5 | 0.23 |",
-        "| two_body | cdm | rates x 0.4 1.5 | - | - | - | - |",
+        "| pendulum | cdm | rates x 0.4 0.5 | 0.5 | 2 | 1.5, 2.5; diverged on seed 2 | 0.23 |",
+        "| two_body | cdm | rates x 0.4 1.5, rates x 2.5 inf | - | - | - | - |",
     ]
