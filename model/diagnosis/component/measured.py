@@ -6,10 +6,11 @@ move under the measured force, such as the frame of a test bench, are treated as
 
 from __future__ import annotations
 
-from collections.abc import Container
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sprung.model.diagnosis.component.given import given_model
 from sprung.model.diagnosis.component.integrated import integrated, without_slow
@@ -129,7 +130,32 @@ def component_records(
             "a system without bodies is a component test: it needs an element between a support and ground (or two "
             "supports) and a sensor {kind: force, element: ...} on it"
         )
-    return [_record(system, values, sample_rate, e, s, rules, laws) for e, s in elements.items()]
+    channels = {element: _channels(system, element, sensor) for element, sensor in elements.items()}
+    values, spikes = _mended(system, values, dict.fromkeys(name for names in channels.values() for name in names))
+    records = []
+    for element, sensor in elements.items():
+        record = _record(system, values, sample_rate, element, sensor, rules, laws)
+        told = _left_out({name: spikes[name] for name in channels[element]}, sample_rate)
+        records.append(replace(record, left_out=told))
+    return records
+
+
+def _channels(system: System, element: str, sensor: str) -> list[str]:
+    """Channels of a component test: its force, and the motion of its ends."""
+    names, ends = [channel.name for channel in system.channels], system.file.elements[element]
+    moved = {ends.upper, ends.lower} & set(system.file.inputs)
+    return [sensor, *(name for name in names if name.split(".")[0] in moved)]
+
+
+def _mended(
+    system: System, values: FloatArray, channels: Iterable[str]
+) -> tuple[FloatArray, dict[str, NDArray[np.intp]]]:
+    """Columns (T, C) without single wrong values of these channels, and by channel where these were."""
+    names, mended, spikes = [channel.name for channel in system.channels], np.array(values, dtype=float), {}
+    for name in channels:
+        at = names.index(name)
+        mended[:, at], spikes[name] = without_spikes(mended[:, at])
+    return mended, spikes
 
 
 def _record(
@@ -173,17 +199,13 @@ def _record(
         held=held,
         delay_std=min(_delay_std(system, sensor), 1 / sample_rate),
     )
-    left_out = _left_out(system, values, sample_rate, element, sensor)
-    return ComponentRecord(element, sensor, task, tuple(notes), given, own, left_out)
+    return ComponentRecord(element, sensor, task, tuple(notes), given, own)
 
 
-def _left_out(system: System, values: FloatArray, sample_rate: float, element: str, sensor: str) -> tuple[str, ...]:
-    """Single wrong values of the channels of a component test that are left out, in words."""
-    names, ends = [channel.name for channel in system.channels], system.file.elements[element]
-    of_ends = [name for name in names if name.split(".")[0] in {ends.upper, ends.lower} & set(system.file.inputs)]
+def _left_out(spikes: Mapping[str, NDArray[np.intp]], sample_rate: float) -> tuple[str, ...]:
+    """Single wrong values that were left out, in words.  spikes: where they were, by channel."""
     told = []
-    for name in (sensor, *of_ends):
-        _, at = without_spikes(values[:, names.index(name)])
+    for name, at in spikes.items():
         if len(at):
             times = ", ".join(f"{index / sample_rate:.2f}" for index in at[:_TOLD])
             what = "a single value" if len(at) == 1 else f"{len(at)} single values"
@@ -344,11 +366,10 @@ def _fixed(system: System, element: str, quantity: str) -> float | None:
 
 
 def _column(values: FloatArray, names: list[str], name: str) -> FloatArray:
-    """A channel (T,) without its single wrong values."""
     series = np.array(values[:, names.index(name)], dtype=float)
     if not np.isfinite(series).any():
         raise DiagnosisError(f"channel {name} has no data in the recording")
-    return without_spikes(series)[0]
+    return series
 
 
 def _integral(rate: FloatArray, sample_rate: float) -> FloatArray:
