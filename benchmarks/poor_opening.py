@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sprung.benchmarks.paper_data import TaskData, data_of
 from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps import evaluate, metrics, output_error, pendulum
-from sprung.model.alps.config import RECIPES, NetworkConfig, TrainingConfig, for_recipe, training_config
+from sprung.model.alps.config import RECIPES, NetworkConfig, for_recipe
 from sprung.model.alps.evaluate import Predicted
-from sprung.model.alps.fit import Split, embedded, train_frames, train_method
-from sprung.model.alps.frames import FrameAutoencoder
+from sprung.model.alps.fit import Split, train_method
 from sprung.model.alps.task import ROLLOUT, WINDOW, Task, windows
 
 TASKS = (pendulum.TASK,)  # of those that have an opening: classical identification is quick there
@@ -32,18 +32,10 @@ _GAUGE_WINDOWS = 200  # labelled training windows for the affine gauge, the same
 Answer = Callable[[Split, Tensor, Tensor], Predicted]  # windows of a split by their rows and starts
 
 
-@dataclass(frozen=True)
-class _OpeningTrial:
-    config: TrainingConfig
-    frames: FrameAutoencoder
-    train: Split
-    test: Split
-
-
 def rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """One row per system, share and method: SE after the affine map, PE."""
     for known in TASKS:
-        data = _data(known, settings)
+        data = data_of(known, settings, settings.seed)
         for share in SHARES:
             task = spoilt(known, share, settings.seed)
             for method in METHODS:
@@ -79,17 +71,7 @@ def spoilt(task: Task, share: float, seed: int) -> Task:
     return replace(task, opening=opening)
 
 
-def _data(task: Task, settings: PaperSettings) -> _OpeningTrial:
-    """Data and embeddings as the task's own rows have them, from their checkpoints where these were made."""
-    config = training_config(task.name, settings.budget, settings.seed)
-    folder = settings.out / settings.budget / task.name / f"seed-{settings.seed}"
-    folder.mkdir(parents=True, exist_ok=True)
-    frames = train_frames(task, config, NetworkConfig(), folder, settings.clock, settings.device)
-    train, test = (embedded(task, config, frames, name, folder, settings.device) for name in ("train", "test"))
-    return _OpeningTrial(config, frames, train, test)
-
-
-def _trained(task: Task, data: _OpeningTrial, settings: PaperSettings, name: str) -> Answer:
+def _trained(task: Task, data: TaskData, settings: PaperSettings, name: str) -> Answer:
     """ALPS that starts from the opening that `task` has."""
     folder = settings.folder / name
     folder.mkdir(exist_ok=True)
@@ -99,7 +81,7 @@ def _trained(task: Task, data: _OpeningTrial, settings: PaperSettings, name: str
     return lambda split, rows, starts: evaluate.predict(model, split, rows, starts, lambda states: states)
 
 
-def _fitted(task: Task, data: _OpeningTrial) -> Answer:
+def _fitted(task: Task, data: TaskData) -> Answer:
     """Output error that starts from the opening that `task` has."""
     reading = output_error.calibrated(task, data.train)
 
@@ -114,7 +96,7 @@ def _fitted(task: Task, data: _OpeningTrial) -> Answer:
     return answer
 
 
-def _figures(task: Task, answer: Answer, data: _OpeningTrial) -> dict[str, float]:
+def _figures(task: Task, answer: Answer, data: TaskData) -> dict[str, float]:
     """SE after an affine map fitted on training windows, and PE, on one window of every test trajectory."""
     rows = torch.arange(min(_GAUGE_WINDOWS, len(data.train.embeddings)))
     like = answer(data.train, rows, rows % (ROLLOUT - WINDOW + 1))

@@ -10,15 +10,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import asdict, replace
 from typing import Any
 
+from sprung.benchmarks.paper_data import TaskData, data_of
 from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps import evaluate, mass_spring_damper, metrics, pendulum, two_body
-from sprung.model.alps.config import RECIPES, NetworkConfig, TrainingConfig, for_recipe, training_config
-from sprung.model.alps.fit import Split, VisualModel, embedded, train_frames, train_method
-from sprung.model.alps.frames import FrameAutoencoder
+from sprung.model.alps.config import RECIPES, NetworkConfig, TrainingConfig, for_recipe
+from sprung.model.alps.fit import VisualModel, train_method
 from sprung.model.alps.posterior import DivergedTraining
 from sprung.model.alps.task import Task
 
@@ -64,16 +63,6 @@ TRIALS: dict[str, dict[str, Change]] = {
 }
 
 
-@dataclass(frozen=True)
-class _SeedData:
-    """What the methods of a task share for one seed."""
-
-    config: TrainingConfig
-    frames: FrameAutoencoder
-    train: Split
-    test: Split
-
-
 def rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """The trials of each task and method, with seed 0; the best on the seed, where it beats the settings of ALPS."""
     for task in TASKS:
@@ -101,9 +90,10 @@ def _trials(task: Task, method: str, settings: PaperSettings) -> Iterator[dict[s
 def _row(task: Task, method: str, trial: str, settings: PaperSettings, seed: int, name: str) -> dict[str, Any]:
     """A method trained with the settings of a trial: SE after the affine map, or that the training has diverged."""
     begin = time.process_time()
-    data = _data(task, settings, seed)
+    data = data_of(task, settings, seed)
     config = TRIALS[method][trial](data.config)
-    folder = _made(settings.folder / task.name / trial.replace(" ", "-"))
+    folder = settings.folder / task.name / trial.replace(" ", "-")
+    folder.mkdir(parents=True, exist_ok=True)
     try:
         model = train_method(
             task, method, data.train, data.frames, config, NetworkConfig(), folder, settings.clock, settings.device
@@ -118,7 +108,7 @@ def _row(task: Task, method: str, trial: str, settings: PaperSettings, seed: int
     }  # fmt: skip
 
 
-def _figures(task: Task, model: VisualModel, data: _SeedData) -> dict[str, Any]:
+def _figures(task: Task, model: VisualModel, data: TaskData) -> dict[str, Any]:
     """SE after an affine map fitted on training windows, over every test window."""
     affine = evaluate.gauge(task, model, data.train)
     found = evaluate.predict(model, data.test, *evaluate.every_window(data.test), affine)
@@ -127,17 +117,3 @@ def _figures(task: Task, model: VisualModel, data: _SeedData) -> dict[str, Any]:
         "SE_affine_relative": metrics.relative_state_error(task, found.simulated, found.true),
     }
     return {key: float(f"{value:.4g}") for key, value in figures.items()}
-
-
-def _data(task: Task, settings: PaperSettings, seed: int) -> _SeedData:
-    """Data and embeddings as the task's own rows have them, from their checkpoints where these were made."""
-    config = training_config(task.name, settings.budget, seed)
-    folder = _made(settings.out / settings.budget / task.name / f"seed-{seed}")
-    frames = train_frames(task, config, NetworkConfig(), folder, settings.clock, settings.device)
-    train, test = (embedded(task, config, frames, name, folder, settings.device) for name in ("train", "test"))
-    return _SeedData(config, frames, train, test)
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

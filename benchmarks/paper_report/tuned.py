@@ -7,10 +7,9 @@ from typing import Any
 
 from sprung.benchmarks.paper_report.comparisons import compare_by_seed
 from sprung.benchmarks.paper_report.tables import head, line
+from sprung.benchmarks.tuned_baselines import AS_ALPS, METHODS, TASKS
 
 FIGURE = "SE_affine"
-AS_ALPS = "as alps"  # the trial with the settings of ALPS
-TASKS, METHODS = ("pendulum", "mass_spring_damper", "two_body"), ("autoencoder", "cdm")
 
 Rows = Sequence[dict[str, Any]]
 
@@ -23,7 +22,7 @@ def tuned_table(rows: Rows) -> str:
     """
     searched = [row for row in rows if row["task"] == "tuning"]
     lines = head("task", "method", "search", "tuned over untuned", "tuned over alps", "of each seed", "p, seeds")
-    for task in TASKS:
+    for task in (known.name for known in TASKS):
         for method in METHODS:
             own = [row for row in searched if row["method"] == f"{task} {method}, {row['trial']}"]
             trials = {row["trial"]: float(row.get(FIGURE, "inf")) for row in own}  # inf: it diverged

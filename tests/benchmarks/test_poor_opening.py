@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from sprung.benchmarks import paper, poor_opening
+from sprung.benchmarks.paper_data import TaskData
 from sprung.model.alps import pendulum
 from sprung.model.alps.config import training_config
 from sprung.model.alps.fit import Split
@@ -39,8 +40,8 @@ def test_rows_name_system_share_and_method(tmp_path: Path, monkeypatch: pytest.M
     angle = rollouts.states[..., 0]
     seen = Split(rollouts, torch.stack([torch.sin(angle), torch.cos(angle)], dim=-1).float())
     config = training_config("pendulum", "quick", 0)
-    data = poor_opening._OpeningTrial(config, None, seen, seen)  # type: ignore[arg-type]
-    monkeypatch.setattr(poor_opening, "_data", lambda *_: data)
+    data = TaskData(config, None, seen, seen)  # type: ignore[arg-type]
+    monkeypatch.setattr(poor_opening, "data_of", lambda *_: data)
     monkeypatch.setattr(poor_opening, "SHARES", (0.0, 1.0))
     right, wrong = paper.run("poor_opening", method="output_error", out=tmp_path)
     assert (right["method"], wrong["method"]) == ("pendulum 0 output_error", "pendulum 1 output_error")
