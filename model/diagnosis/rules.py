@@ -495,7 +495,7 @@ class ComponentRules:
     another_force: float = rule(
         0.5, "of what laws leave, left beside an unnamed force that they lack; chosen: most of it", 0.3, 0.7
     )
-    spikes: int = rule(20, "single values of a channel that are left out; chosen: more are no exception", 10, 50)
+    spikes: int = rule(20, "wrong values or pairs of a channel, to be left out; chosen: more are no exception", 10, 50)
     spike: float = rule(
         4.0, "times what is left between neighbours, that such a value is off; derived: a step leaves a third", 3.2, 6.0
     )

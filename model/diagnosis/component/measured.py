@@ -6,16 +6,15 @@ move under the measured force, such as the frame of a test bench, are treated as
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sprung.model.diagnosis.component.given import given_model
 from sprung.model.diagnosis.component.integrated import integrated, without_slow
 from sprung.model.diagnosis.component.own import observed, own_pieces
-from sprung.model.diagnosis.component.spikes import without_spikes
+from sprung.model.diagnosis.component.spikes import WrongValues, without_wrong_values
 from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentModel, ComponentTask, NominalValues
 from sprung.model.diagnosis.force.motion import (
     element_motion,
@@ -33,7 +32,7 @@ from sprung.model.schema import GROUND, ElementSensor, Sensor, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-_TOLD = 5  # times of single wrong values that are listed
+_TOLD = 5  # times of wrong values that are listed
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class ComponentRecord:
     notes: tuple[str, ...]
     given: ComponentModel = NO_LAWS  # laws of the system file
     own: tuple[Piece, ...] = ()  # user-defined laws of the search
-    left_out: tuple[str, ...] = ()  # single wrong values of the channels, in words
+    left_out: tuple[str, ...] = ()  # wrong values of the channels, in words
 
 
 @dataclass(frozen=True)
@@ -131,11 +130,11 @@ def component_records(
             "supports) and a sensor {kind: force, element: ...} on it"
         )
     channels = {element: _channels(system, element, sensor) for element, sensor in elements.items()}
-    values, spikes = _mended(system, values, dict.fromkeys(name for names in channels.values() for name in names))
+    values, wrong = _mended(system, values, dict.fromkeys(name for names in channels.values() for name in names))
     records = []
     for element, sensor in elements.items():
         record = _record(system, values, sample_rate, element, sensor, rules, laws)
-        told = _left_out({name: spikes[name] for name in channels[element]}, sample_rate)
+        told = _left_out({name: wrong[name] for name in channels[element]}, sample_rate)
         records.append(replace(record, left_out=told))
     return records
 
@@ -147,15 +146,13 @@ def _channels(system: System, element: str, sensor: str) -> list[str]:
     return [sensor, *(name for name in names if name.split(".")[0] in moved)]
 
 
-def _mended(
-    system: System, values: FloatArray, channels: Iterable[str]
-) -> tuple[FloatArray, dict[str, NDArray[np.intp]]]:
-    """Columns (T, C) without single wrong values of these channels, and by channel where these were."""
-    names, mended, spikes = [channel.name for channel in system.channels], np.array(values, dtype=float), {}
+def _mended(system: System, values: FloatArray, channels: Iterable[str]) -> tuple[FloatArray, dict[str, WrongValues]]:
+    """Columns (T, C) without wrong values of these channels, and by channel where these were."""
+    names, mended, wrong = [channel.name for channel in system.channels], np.array(values, dtype=float), {}
     for name in channels:
         at = names.index(name)
-        mended[:, at], spikes[name] = without_spikes(mended[:, at])
-    return mended, spikes
+        mended[:, at], wrong[name] = without_wrong_values(mended[:, at])
+    return mended, wrong
 
 
 def _record(
@@ -202,17 +199,28 @@ def _record(
     return ComponentRecord(element, sensor, task, tuple(notes), given, own)
 
 
-def _left_out(spikes: Mapping[str, NDArray[np.intp]], sample_rate: float) -> tuple[str, ...]:
-    """Single wrong values that were left out, in words.  spikes: where they were, by channel."""
+def _left_out(wrong: Mapping[str, WrongValues], sample_rate: float) -> tuple[str, ...]:
+    """Wrong values that were left out, in words; by channel."""
     told = []
-    for name, at in spikes.items():
-        if len(at):
-            times = ", ".join(f"{index / sample_rate:.2f}" for index in at[:_TOLD])
-            what = "a single value" if len(at) == 1 else f"{len(at)} single values"
-            verb, left = ("stands", "was") if len(at) == 1 else ("stand", "were")
-            more = " and later" if len(at) > _TOLD else ""
-            told.append(f"{name}: {what}, at {times} s{more}, {verb} out from all other changes and {left} left out")
+    for name, values in wrong.items():
+        if len(values.at):
+            few, times = len(values.at) == 1, _times(values.at.tolist(), sample_rate)
+            one, some = (
+                ("a single value", "single values") if values.width == 1 else ("a pair of values", "pairs of values")
+            )
+            what = one if few else f"{len(values.at)} {some}"
+            stand, were = ("stands", "was") if few else ("stand", "were")
+            told.append(f"{name}: {what}, at {times}, {stand} out from all other changes and {were} left out")
+        if values.dropouts:
+            times = _times([run.start for run in values.dropouts], sample_rate)
+            told.append(f"{name} drops out, at {times}: what it repeats there was left out")
     return tuple(told)
+
+
+def _times(at: Sequence[int], sample_rate: float) -> str:
+    """The first of some samples' times, in words."""
+    more = " and later" if len(at) > _TOLD else ""
+    return ", ".join(f"{index / sample_rate:.2f}" for index in at[:_TOLD]) + f" s{more}"
 
 
 def _noise(measured: _Measured, rests: list[slice], run: slice, cell: Sensor, rules: Rules) -> tuple[float, float]:
