@@ -79,6 +79,7 @@ class Identifier:
 
         windows: (B, T, C) in the order of `system.channels`, NaN columns for channels that are absent.
         start: log-ratios (B, P) to refine from, such as the tracker's; the estimator's where left out.
+        states: estimates hold the simulated outputs; what the vehicle carries is refined along, as sensors show it.
         weigh: windows (B,) whose evidence on gains, delays and loads is wanted, see `Estimate.deviating`.
         A window that lacks all sensors, or inputs without which nothing can be said (`System.needed`), is not
         identified, with the reason.  Errors: `UnusableWindow` for a wrong shape or infinite values.
@@ -92,7 +93,7 @@ class Identifier:
             return []
         windows = self.system.undistorted(windows)
         self._allow(windows)
-        loads = any(load.declared for load in self.system.loads)
+        loads = bool(self.system.loads) if states else any(load.declared for load in self.system.loads)
         begin = time.perf_counter()
         start = self._start(windows, start, loads=loads)
         between = time.perf_counter()

@@ -15,7 +15,7 @@ from sprung.service.api import models
 from sprung.service.api.access import CoreOf, known_vehicle, read
 from sprung.service.api.actors import ActorOf
 from sprung.service.api.answers import json_response
-from sprung.service.api.bodies import LINE_PATTERN, TEXT_PATTERN, StrictBody
+from sprung.service.api.bodies import LINE, TEXT, StrictBody
 from sprung.service.api.fleet import vehicle_answer
 from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.problems import ApiProblem
@@ -25,9 +25,7 @@ from sprung.service.store.marks import MarkRow
 from sprung.service.times import AHEAD, from_iso, now_ns, to_iso
 
 router = APIRouter(tags=["operation"])
-Text = Annotated[
-    str, Field(min_length=1, max_length=2000, pattern=TEXT_PATTERN, examples=["damper 2l replaced, order 4711"])
-]
+Text = Annotated[str, Field(min_length=1, max_length=2000, examples=["damper 2l replaced, order 4711"]), *TEXT]
 
 
 class AcknowledgeBody(StrictBody):
@@ -62,8 +60,8 @@ class MaintenanceBody(NoteBody):
 class VehicleBody(StrictBody):
     """Fields to be changed; omitted ones are kept."""
 
-    label: str | None = Field(
-        default=None, max_length=128, pattern=LINE_PATTERN, description="display name; empty removes it"
+    label: Annotated[str, Field(max_length=128), *LINE] | None = Field(
+        default=None, description="display name; empty removes it"
     )
     retired: bool | None = Field(default=None, description="out of service: not listed, data kept")
 

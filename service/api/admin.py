@@ -18,7 +18,7 @@ from sprung.service.access.tokens import FLEET
 from sprung.service.api.access import CoreOf, read
 from sprung.service.api.actors import ActorOf
 from sprung.service.api.answers import json_response
-from sprung.service.api.bodies import LINE_PATTERN, StrictBody
+from sprung.service.api.bodies import LINE, StrictBody
 from sprung.service.errors import Busy
 from sprung.service.store import audit
 from sprung.service.store.tokens import TokenRow
@@ -38,7 +38,7 @@ Scope = Literal["read", "ingest", "operate", "admin"]
 class TokenBody(StrictBody):
     """A token to be made."""
 
-    name: Annotated[str, Field(min_length=1, max_length=128, pattern=LINE_PATTERN)]
+    name: Annotated[str, Field(min_length=1, max_length=128), *LINE]
     scopes: Annotated[list[Scope], Field(min_length=1, max_length=4)]
     fleet: Annotated[
         str, Field(max_length=128, pattern=f"^{FLEET.pattern}$", description="vehicles whose ids begin so; empty: all")

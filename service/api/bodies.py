@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import partial
 from itertools import chain
 from typing import Annotated
 
@@ -33,8 +34,21 @@ def _vehicle_id(text: str) -> str:
 VehicleId = Annotated[
     str, AfterValidator(_vehicle_id), WithJsonSchema({"type": "string", "pattern": VEHICLE_ID.pattern})
 ]
-LINE_PATTERN = f"^[^{CONTROL}{UNSEEN}]*$"
-TEXT_PATTERN = rf"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f{UNSEEN}]*$"  # with lines and tabs
+_IN_LINES = f"{CONTROL}{UNSEEN}"
+_IN_TEXTS = rf"\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f{UNSEEN}"  # lines and tabs are allowed
+
+
+def _without(hidden: str, text: str) -> str:
+    """The text, if it has no character of the class `hidden`: the first is named, as people type these texts and a
+    regular expression tells them nothing."""
+    if (found := re.search(f"[{hidden}]", text)) is None:
+        return text
+    said = "holds the hidden character {point} at place {place}; leave it out"
+    raise PydanticCustomError("hidden_character", said, {"point": f"U+{ord(found[0]):04X}", "place": found.start() + 1})
+
+
+LINE = (AfterValidator(partial(_without, _IN_LINES)), Field(json_schema_extra={"pattern": f"^[^{_IN_LINES}]*$"}))
+TEXT = (AfterValidator(partial(_without, _IN_TEXTS)), Field(json_schema_extra={"pattern": f"^[^{_IN_TEXTS}]*$"}))
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
 LARGEST = 1e12  # of a sample, in SI units
 MOST_CHANNELS = 1000

@@ -68,7 +68,8 @@ def outcome_of(window: Window, estimate: Estimate | None) -> tuple[str, str | No
     if estimate is None:
         return window.outcome, window.reason
     if not estimate.informative:
-        lost = list(dict.fromkeys(fault.channel for fault in estimate.faults)) if estimate.running else []
+        wrong = [channel for fault in estimate.faults for channel in fault.channel.split("|")]
+        lost = list(dict.fromkeys(wrong)) if estimate.running else []
         return "uninformative", lost_channels(lost) if lost else NO_EXCITATION
     return (window.outcome if estimate.identified else "dropped"), estimate.reason or window.reason
 

@@ -6,9 +6,10 @@ far the bogies are apart.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,7 +22,8 @@ COLUMN, GAP, MARGIN = 70.0, 46.0, 64.0  # px
 LONGEST = 5  # letters of a name at the usual size
 STOREY, THICKNESS, WHEEL = 112.0, 34.0, 20.0
 LETTER = 8.0  # px, of a name
-SCALED = 700.0  # px: wider drawings are scaled down on phones, where their labels have to grow
+SCALED = 700.0  # px: wider drawings are cut into pieces, which stand below each other on phones
+PIECE = 520.0  # px, about: of these labels are read on a phone
 ROW = 62.0  # of the plan
 WORDS = {  # state -> what it says in words
     "ok": "good",
@@ -86,6 +88,49 @@ def columns(system: System) -> DrawingColumns:
     return DrawingColumns(layout, at, across - column / 2 + MARGIN, column)
 
 
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """Something drawn: at one place, then it belongs to one piece; or along the drawing, then each piece shows its own
+    of it."""
+
+    left: float  # px
+    right: float
+    drawn: str
+
+
+def _at(across: float, drawn: str) -> _Drawn:
+    return _Drawn(across, across, drawn)
+
+
+def _cuts(found: DrawingColumns) -> list[float]:
+    """px of the ends of the pieces: cut between columns, near equal parts, where the gap is widest of those as near."""
+    ends = [0.0, found.width]
+    if found.width <= SCALED:
+        return ends
+    middles = sorted(found.at.values())
+    between = [((a + b) / 2, b - a) for a, b in pairwise(middles)]
+    count = round(found.width / PIECE)
+    for part in range(1, count):
+        aim = part * found.width / count
+        ends.append(min(between, key=lambda cut: abs(cut[0] - aim) - cut[1])[0])
+    return sorted(set(ends))
+
+
+def _assembled(found: DrawingColumns, height: float, label: str, parts: Sequence[_Drawn]) -> str:
+    """The drawing in one piece, or in several that are seen as one where there is room beside each other."""
+    cuts = _cuts(found)
+    drawn = []
+    for number, (left, right) in enumerate(pairwise(cuts), start=1):
+        named = label if len(cuts) == 2 else f"{label}, part {number} of {len(cuts) - 1}"
+        inside = [part.drawn for part in parts if part.left < right and (part.right > left or part.left >= left)]
+        kind = "vehicle" if len(cuts) == 2 else "vehicle wide"
+        drawn.append(
+            f'<svg class="{kind}" viewBox="{left:.0f} 0 {right - left:.0f} {height:.0f}" width="{right - left:.0f}" '
+            f'height="{height:.0f}" role="group" aria-label="{escape(named)}">{"".join(inside)}</svg>'
+        )
+    return drawn[0] if len(drawn) == 1 else f'<div class="pieces">{"".join(drawn)}</div>'
+
+
 def short_names(names: Iterable[str]) -> dict[str, str]:
     """`primary_11l` -> `11l` where several names share what comes before."""
     every = list(names)
@@ -109,14 +154,15 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
     foot = 46.0 + storeys * (STOREY + THICKNESS)  # px of the ground
     height = foot + 2 * WHEEL + 26
     short = short_names(system.elements)
-    parts = [_open(found.width, height, f"{system.name} from the side: springs, dampers and sensors with their states")]
+    label = f"{system.name} from the side: springs, dampers and sensors with their states"
     tops = {name: foot - level * STOREY - (level - 1) * THICKNESS - THICKNESS for name, level in layout.level.items()}
-    parts += _ground(found, foot, sensors)
+    parts = _ground(found, foot, sensors)
     for name in sorted(file.bodies, key=lambda body: layout.level[body]):
-        parts.append(_body(found, name, tops[name]))
+        parts += _body(found, name, tops[name])
     spans = {name: _span(file.elements[name].upper, file.elements[name].lower, tops, foot) for name in system.elements}
     for name, (head, base) in spans.items():
-        parts.append(_element(name, short[name], found.across(*layout.element_position(name)), head, base, parameters))
+        across = found.across(*layout.element_position(name))
+        parts.append(_at(across, _element(name, short[name], across, head, base, parameters)))
     parts += _captions(system, foot, tops)
     names = short_names(system.sensors)
     for name, sensor in file.sensors.items():
@@ -129,11 +175,11 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
                 for element, (_, base) in spans.items()
             )
             across += found.column / 2 if stands else 0.0  # beside the element that stands there
-            parts.append(_sensor(name, names[name], across, tops[body], sensors))
+            parts.append(_at(across, _sensor(name, names[name], across, tops[body], sensors)))
         else:
             across = found.across(*layout.element_position(sensor.element)) + found.column / 2
-            parts.append(_sensor(name, names[name], across, sum(spans[sensor.element]) / 2, sensors))
-    return "".join([*parts, "</svg>"])
+            parts.append(_at(across, _sensor(name, names[name], across, sum(spans[sensor.element]) / 2, sensors)))
+    return _assembled(found, height, label, parts)
 
 
 def _span(upper: str, lower: str, tops: Mapping[str, float], foot: float) -> tuple[float, float]:
@@ -153,23 +199,30 @@ def plan_view(system: System, parameters: Mapping[str, Mark]) -> str:
     sides = sorted({y for _, y in places}, reverse=True)
     rows = {y: 30.0 + ROW * i for i, y in enumerate(sides)}
     short = short_names(system.elements)
-    parts = [_open(found.width, 30.0 + ROW * len(sides), f"{system.name} from above: the worst state of each element")]
+    parts = list[_Drawn]()
     for y, row in rows.items():
         side = "left" if y > 0 else "right" if y < 0 else ""
-        parts.append(f'<line class="rail" x1="{MARGIN / 2}" x2="{found.width - 8}" y1="{row}" y2="{row}"/>')
-        parts.append(f'<text class="caption" x="4" y="{row - 8}">{side}</text>')
+        ends = MARGIN / 2, found.width - 8
+        parts.append(_Drawn(*ends, f'<line class="rail" x1="{ends[0]}" x2="{ends[1]}" y1="{row}" y2="{row}"/>'))
+        parts.append(_at(4, f'<text class="caption" x="4" y="{row - 8}">{side}</text>'))
+        parts += [
+            _at(cut, f'<text class="caption again" x="{cut + 2:.1f}" y="{row - 8}">{side}</text>')
+            for cut in _cuts(found)[1:-1]
+        ]
     for (x, y), names in places.items():
         sizes = [LETTER * (len(short[name]) + 1) for name in names]
         starts = found.across(x, y) - sum(sizes) / 2 + np.cumsum([0.0, *sizes[:-1]])
         for name, start, size in zip(names, starts, sizes, strict=True):
             mark = worst(parameters.get(f"{name}.{q}") for q in ("stiffness", "damping"))
             across = start + size / 2
-            parts.append(
+            drawn = (
                 f'<a href="#{escape(name)}" data-element="{escape(name)}"><title>{escape(mark.words(name))}</title>'
                 f'<circle class="dot {mark.state}" cx="{across:.1f}" cy="{rows[y]:.1f}" r="11"/>'
                 f'<text class="name" x="{across:.1f}" y="{rows[y] + 26:.1f}">{escape(short[name])}</text></a>'
             )
-    return "".join([*parts, "</svg>"])
+            parts.append(_at(across, drawn))
+    label = f"{system.name} from above: the worst state of each element"
+    return _assembled(found, 30.0 + ROW * len(sides), label, parts)
 
 
 def small_view(system: System, found: DrawingColumns, letters: str) -> str:
@@ -195,15 +248,7 @@ def worst(marks: Iterable[Mark | None]) -> Mark:
     return max((mark for mark in marks if mark is not None), key=lambda m: order.index(m.state), default=Mark("fixed"))
 
 
-def _open(width: float, height: float, label: str) -> str:
-    kind = "vehicle wide" if width > SCALED else "vehicle"
-    return (
-        f'<svg class="{kind}" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" height="{height:.0f}" '
-        f'role="group" aria-label="{escape(label)}">'
-    )
-
-
-def _body(found: DrawingColumns, name: str, top: float) -> str:
+def _body(found: DrawingColumns, name: str, top: float) -> list[_Drawn]:
     layout = found.layout
     own = [
         found.across(*layout.element_position(element))
@@ -214,10 +259,14 @@ def _body(found: DrawingColumns, name: str, top: float) -> str:
     right = max(own, default=found.width / 2) + found.column / 2 - 4
     missing = max(LETTER * (len(name) + 1) + 8 - (right - left), 0.0)  # px for the whole name
     left, right = left - missing / 2, right + missing / 2
-    return (
-        f'<rect class="body" x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{THICKNESS}" rx="5"/>'
-        f'<text class="bodyname" x="{left + 8:.1f}" y="{top + 22:.1f}">{escape(name)}</text>'
-    )
+    box = f'<rect class="body" x="{left:.1f}" y="{top:.1f}" width="{right - left:.1f}" height="{THICKNESS}" rx="5"/>'
+    text = f'y="{top + 22:.1f}">{escape(name)}</text>'
+    again = [cut for cut in _cuts(found)[1:-1] if left < cut < right]  # pieces to which the body goes on
+    return [
+        _Drawn(left, right, box),
+        _at(left, f'<text class="bodyname" x="{left + 8:.1f}" {text}'),
+        *(_at(cut, f'<text class="bodyname again" x="{cut + 8:.1f}" {text}') for cut in again),
+    ]
 
 
 def _element(name: str, short: str, across: float, head: float, base: float, parameters: Mapping[str, Mark]) -> str:
@@ -261,9 +310,9 @@ def _sensor(name: str, short: str, across: float, top: float, sensors: Mapping[s
     )
 
 
-def _ground(found: DrawingColumns, foot: float, sensors: Mapping[str, Mark]) -> list[str]:
+def _ground(found: DrawingColumns, foot: float, sensors: Mapping[str, Mark]) -> list[_Drawn]:
     """Wheels, or the tables of a rig, with what is wrong with the channels that measure their motion."""
-    layout, parts = found.layout, []
+    layout, parts = found.layout, list[_Drawn]()
     supports = {name for name, source in layout.system.file.inputs.items() if not isinstance(source, ForceInput)}
     for name, item in layout.system.file.elements.items():
         if not {item.upper, item.lower} & supports:
@@ -278,20 +327,23 @@ def _ground(found: DrawingColumns, foot: float, sensors: Mapping[str, Mark]) -> 
         title = f"<title>{escape('; '.join(mark.words(channel) for channel, mark in wrong.items()))}</title>"
         inside = title if wrong else ""
         if layout.railway:
-            parts.append(
+            drawn = (
                 f'<circle class="wheel{state}" cx="{across:.1f}" cy="{foot + WHEEL:.1f}" r="{WHEEL}">{inside}</circle>'
             )
         else:  # a test rig: a table that is moved up and down
             box = f'x="{across - 30:.1f}" y="{foot:.1f}" width="60" height="12"'
-            parts.append(f'<rect class="table{state}" {box}>{inside}</rect>')
-            parts.append(f'<path class="arrow" d="M{across:.1f},{foot + 16:.1f}v22m-4,-18l4,-5l4,5m-8,14l4,5l4,-5"/>')
+            arrow = f'<path class="arrow" d="M{across:.1f},{foot + 16:.1f}v22m-4,-18l4,-5l4,5m-8,14l4,5l4,-5"/>'
+            drawn = f'<rect class="table{state}" {box}>{inside}</rect>{arrow}'
+        parts.append(_at(across, drawn))
     floor = foot + 2 * WHEEL if layout.railway else foot + WHEEL * 2 + 4
     if not supports:
         floor = foot
-    return [*parts, f'<line class="rail" x1="8" x2="{found.width - 8:.1f}" y1="{floor:.1f}" y2="{floor:.1f}"/>']
+    right = found.width - 8
+    rail = f'<line class="rail" x1="8" x2="{right:.1f}" y1="{floor:.1f}" y2="{floor:.1f}"/>'
+    return [*parts, _Drawn(8.0, right, rail)]
 
 
-def _captions(system: System, foot: float, tops: Mapping[str, float]) -> list[str]:
+def _captions(system: System, foot: float, tops: Mapping[str, float]) -> list[_Drawn]:
     """What the names of a storey have in common, at its left edge."""
     heads: dict[str, float] = {}
     for name in system.elements:
@@ -299,4 +351,4 @@ def _captions(system: System, foot: float, tops: Mapping[str, float]) -> list[st
         known = [tops[end] for end in (item.upper, item.lower) if end in tops]
         if "_" in name and sum(other.startswith(name.split("_", 1)[0] + "_") for other in system.elements) > 1:
             heads.setdefault(name.split("_", 1)[0], min(known, default=foot - STOREY) + THICKNESS)
-    return [f'<text class="caption" x="4" y="{y + 50:.1f}">{escape(head)}</text>' for head, y in heads.items()]
+    return [_at(4, f'<text class="caption" x="4" y="{y + 50:.1f}">{escape(head)}</text>') for head, y in heads.items()]

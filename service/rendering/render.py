@@ -33,6 +33,7 @@ def _environment() -> Environment:
     )
     environment.filters |= {"quantity": quantity, "percent": percent, "code": code, "moment": moment, "spoken": spoken}
     environment.filters["state"] = state
+    environment.globals["with_std"] = with_std
     environment.globals |= {"asset": asset, "signed_in": signed_in.get, "size_in_words": size_in_words}
     return environment
 
@@ -67,6 +68,16 @@ def quantity(value: float, unit: str) -> str:
             if abs(value) >= factor:
                 return f"{value / factor:.4g} {prefix}{unit}"
     return f"{value:.4g} {unit}"
+
+
+def with_std(value: float, std: float, unit: str) -> tuple[str, str]:
+    """A value and its deviation as people write them, `("1.233", "± 0.014 MN/m")`: one unit, two digits of the
+    deviation, and none of the value beyond those; `quantity` of the value where the deviation is none."""
+    if not (math.isfinite(value) and 0 < std < math.inf):
+        return quantity(value, unit), ""
+    factor, prefix = next(((f, p) for f, p in PREFIXES if abs(value) >= f and unit != "kg"), (1.0, ""))
+    digits = max(0, 1 - math.floor(math.log10(std / factor)))
+    return f"{value / factor:.{digits}f}", f"± {std / factor:.{digits}f} {prefix}{unit}"
 
 
 def state(name: str) -> str:

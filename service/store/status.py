@@ -287,7 +287,12 @@ def outdated(connection: Connection, model_id: int) -> list[str]:
 
 def without_numbers(reason: str) -> str:
     """A reason as a kind of reason: measured numbers in it are left out; limits ("longer than 10 s") and names with
-    digits stay."""
+    digits stay.
+
+    >>> without_numbers("tells nothing without car_1l and 3 more"), without_numbers("a gap of 0.4 s")
+    ('tells nothing without car_1l and others', 'a gap of N s')
+    """
+    reason = re.sub(r"\band \d+ more\b", "and others", reason)
     return re.sub(r"(?<![\w.])(?<!than )[-+]?\d+(\.\d+)?(?![\w.])", "N", reason)[:200]
 
 

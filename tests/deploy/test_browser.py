@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
@@ -29,7 +30,8 @@ from sprung.service.store import work
 from sprung.service.store.circumstances import WindowCircumstances, add_circumstances
 from sprung.service.store.lists import list_jobs
 from sprung.service.store.schema import fleet_status
-from sprung.service.times import now_ns
+from sprung.service.store.status import fleet_row
+from sprung.service.times import now_ns, to_iso
 from tests.oidc_provider import provider_settings, running_provider
 from tests.report_made import friction_report
 from tests.service_fakes import REPORT, STANDING, START, make_window
@@ -154,13 +156,18 @@ def test_a_long_name_hides_nothing_of_the_fleet(served: tuple[str, Core], browse
 
 
 def test_the_drawing_is_whole_and_readable_on_a_phone(address: str, browser: Any) -> None:
-    page = browser.new_page(viewport={"width": 380, "height": 900})
+    page = browser.new_page(viewport={"width": 375, "height": 900})
     page.goto(address + PAGES["vehicle"])
+    drawn = "e => parseFloat(getComputedStyle(e).fontSize) * e.getScreenCTM().a"
+    sizes = page.evaluate(
+        f"[...document.querySelectorAll('#drawing svg text')].filter(e => e.getBBox().width).map({drawn})"
+    )
+    assert len(sizes) > 30 and min(sizes) > 10
     boxes = "[...document.querySelectorAll('#drawing svg text:not(.caption)')].map(e => e.getBoundingClientRect())"
     labels = page.evaluate(f"{boxes}.map(b => [b.left, b.right, b.top, b.height])")
     assert len(labels) > 30
     for left, right, _, height in labels:
-        assert left >= 0 and right <= 380 and height >= 8
+        assert left >= 0 and right <= 375 and height >= 8
     for kind in (".name", ".sensorname", ".said"):
         found = page.evaluate(
             f"{boxes.replace('text:not(.caption)', kind)}.map(b => [b.left, b.right, b.top, b.bottom])"
@@ -290,6 +297,96 @@ def test_a_history_is_laid_beside_its_twins_and_zoomed_down_to_single_windows(ad
     assert int(shown().split()[0]) in (14, 15, 16)
     page.locator("#plot .u-over").dblclick()
     assert shown() == "140 points, single windows"
+    page.close()
+
+
+def shown(page: Any) -> str:
+    """What is said of the history, once it is drawn."""
+    page.wait_for_timeout(900)
+    return str(page.inner_text("#shown"))
+
+
+def test_what_is_shown_of_a_history_stays_over_reloads_links_and_the_way_back(address: str, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.goto(address + PAGES["vehicle"])
+    begun = page.input_value("#parameter")
+    page.select_option("#parameter", "secondary_1l.damping")
+    page.select_option("#overlay", "side")
+    page.get_by_role("button", name="10 min").click()
+    page.get_by_role("button", name="zoom in").click()
+    told = shown(page)
+    page.reload()
+    assert shown(page) == told
+    assert [page.input_value(box) for box in ("#parameter", "#overlay")] == ["secondary_1l.damping", "side"]
+    other = browser.new_page(viewport={"width": 1400, "height": 900})
+    other.goto(page.url)
+    assert shown(other) == told and other.input_value("#parameter") == "secondary_1l.damping"
+    other.evaluate("location.hash = 'primary_12r.damping'")
+    shown(other)
+    assert other.input_value("#parameter") == "primary_12r.damping"
+    other.goto(address)
+    other.goto(f"{address}{PAGES['vehicle']}#%zz&since=never")  # nobody's link
+    assert "points" in shown(other) and other.input_value("#parameter") == begun
+    other.close()
+    page.go_back()
+    shown(page)
+    assert page.input_value("#parameter") == begun and "points" in shown(page)
+    page.close()
+
+
+def test_ranges_without_a_window_and_the_narrowest_are_told(address: str, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    wrong: list[str] = []
+    page.on("response", lambda answer: wrong.append(answer.url) if answer.status >= 400 else None)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.goto(address + PAGES["vehicle"])
+    shown(page)
+    for _ in range(30):
+        page.get_by_role("button", name="zoom in").click()
+    assert shown(page) == "2 points, single windows"
+    for _ in range(60):
+        page.get_by_role("button", name="zoom out").click()
+    assert shown(page).startswith("140 points")
+    page.get_by_role("button", name="1 min").click()
+    for _ in range(10):
+        page.get_by_role("button", name="later").click()
+    assert shown(page) == "no window in this range: “all” shows every one"
+    page.get_by_role("button", name="all", exact=True).click()
+    assert shown(page).startswith("140 points") and wrong == []
+    page.close()
+
+
+def test_a_range_up_to_the_newest_window_follows_it(served: tuple[str, Core], browser: Any, system: System) -> None:
+    address, core = served
+    core.pipeline.process("car-23", [make_window(system, i) for i in range(300)])
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.goto(f"{address}/pages/vehicles/car-23")
+    page.get_by_role("button", name="1 min").click()
+    shown(page)
+    page.wait_for_timeout(1000)
+    core.pipeline.process("car-23", [make_window(system, i) for i in range(300, 420)])  # another minute
+    page.locator("#status", has_text="last change").wait_for()
+    shown(page)
+    page.get_by_text("The newest points as a table").click()
+    newest = page.locator("#table tr").last.inner_text()
+    with core.store.read() as connection:
+        row = fleet_row(connection, "car-23")
+    assert row is not None and row.last_window_ns is not None
+    assert newest.startswith(to_iso(row.last_window_ns)[:19].replace("T", " "))
+    page.close()
+    core.operations.remove("test", "car-23")
+
+
+def test_who_picks_parameters_after_a_repair_has_these_learned_anew(address: str, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.goto(address + PAGES["vehicle"])
+    page.get_by_role("button", name="Mark maintenance").click()
+    page.fill("#worktext", "damper exchanged")
+    page.select_option("select[name=parameters]", "secondary_2r.damping")
+    assert page.get_by_label("of these").is_checked()
+    page.select_option("select[name=parameters]", [])
+    page.locator("dialog[open] button.first").click()
+    page.locator("dialog[open] [role=alert]", has_text="Choose at least one parameter").wait_for()
     page.close()
 
 
@@ -500,6 +597,41 @@ def test_an_upload_is_followed_to_its_report_and_what_was_found_is_put_to_use(
     page.wait_for_selector("#models:has-text('coulomb_friction')", timeout=60_000)
     assert "the vehicle's own" in page.inner_text("main").replace("’", "'")
     page.close()
+
+
+def endless(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
+    """A diagnosis that ends only when it is cancelled."""
+    time.sleep(600)
+    raise AssertionError
+
+
+def test_a_job_is_cancelled_and_an_upload_stopped_in_the_page(
+    served: tuple[str, Core], browser: Any, tmp_path: Path
+) -> None:
+    address, core = served
+    core.diagnosis_jobs.task = endless
+    (tmp_path / "ride.csv").write_text("time,car_1l\n" + "1790000000.0,0.0\n" * 1000)
+    (tmp_path / "long.csv").write_text("time,car_1l\n" + "1790000000.0,0.0\n" * 2_000_000)
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.goto(f"{address}/pages/work")
+    page.set_input_files("#file", tmp_path / "ride.csv")
+    page.fill("#vehicle", "car-18")
+    page.select_option("#what", "/diagnose")
+    page.get_by_role("button", name="Upload").click()
+    page.get_by_role("button", name="Cancel diagnosis of car-18").click(timeout=60_000)
+    page.locator("#jobs:has-text('cancelled')").wait_for(timeout=60_000)
+    assert page.get_by_role("button", name="Cancel diagnosis of car-18").count() == 0
+    slow = page.context.new_cdp_session(page)
+    slow.send("Network.enable")
+    conditions = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 500_000}
+    slow.send("Network.emulateNetworkConditions", conditions)
+    page.set_input_files("#file", tmp_path / "long.csv")
+    page.get_by_role("button", name="Upload").click()
+    page.get_by_role("button", name="Stop sending").click()
+    page.locator("#outcome", has_text="stopped").wait_for()
+    page.close()
+    while list(core.settings.uploads.glob("*.part*")):  # what had come is removed
+        time.sleep(0.1)
 
 
 def test_people_sign_in_with_their_organisation(engine: Engine, browser: Any, data_dir: Path) -> None:

@@ -19,7 +19,9 @@ const acts = (() => {
 
   async function follow(job, show) {
     for (;;) {
-      const now = await (await ask(`/jobs/${job}`)).json();
+      const answer = await ask(`/jobs/${job}`);
+      const now = await answer.json().catch(() => ({}));
+      if (!answer.ok) throw new Error(now.detail || answer.statusText);
       show(now);
       if (now.state === "done" || now.state === "failed") return now;
       await new Promise((wait) => setTimeout(wait, 1000));
@@ -43,7 +45,7 @@ const acts = (() => {
       button.disabled = true;
       try {
         const found = await send(button.dataset.method || "POST", button.dataset.post, JSON.parse(button.dataset.body || "{}"));
-        if (found.state && found.kind) {
+        if (button.hasAttribute("data-follow")) {
           const now = await follow(found.id, (at) => { outcome().textContent = `${at.kind} ${told(at)}`; });
           if (now.result?.report) {
             const link = document.createElement("a");
@@ -51,7 +53,7 @@ const acts = (() => {
             link.textContent = ` report: ${now.result.verdict.replaceAll("_", " ")}`;
             outcome().append(link);
           }
-        } else location.reload();
+        } else if (document.dispatchEvent(new CustomEvent("acted", { cancelable: true }))) location.reload();
       } catch (error) {
         if (outcome()) outcome().textContent = error.message;
       }
@@ -72,6 +74,10 @@ const acts = (() => {
     const which = form.elements.which?.value;
     if (which === "some") body.parameters = [...form.elements.parameters.selectedOptions].map((o) => o.value);
     if (which === "none") body.parameters = [];
+    if (which === "some" && !body.parameters.length) {
+      form.querySelector("[role=alert]").textContent = "Choose at least one parameter, or “of none”.";
+      return;
+    }
     let url = form.dataset.action;
     if (form.elements.confirm) url += `?confirm=${encodeURIComponent(form.elements.confirm.value)}`;
     const method = form.dataset.method || "POST";
@@ -82,6 +88,10 @@ const acts = (() => {
     } catch (error) {
       form.querySelector("[role=alert]").textContent = error.message;
     }
+  });
+
+  document.addEventListener("change", ({ target }) => { // who chooses some means these
+    if (target.name === "parameters" && target.form?.elements.which) target.form.elements.which.value = "some";
   });
 
   return { send, follow, told, csrf, key };

@@ -8,9 +8,55 @@
   const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const COLOURS = ["--blue", "--alarm", "--good", "--warning", "--learning"];
   const BAND = 1.96;
+  const LATEST = 4e9; // s: what the service takes for the end of a range
   let range = null; // [from, to] in s; null: all
+  let newestSeconds = 0; // that are shown instead, up to the newest window whenever one comes; 0: none
   let plots = [];
   let request = 0;
+
+  function span() {
+    if (!newestSeconds || !data.last) return range;
+    const end = data.last / 1e3 + data.hop;
+    return [end - newestSeconds, end];
+  }
+
+  function bounded([from, to]) {
+    const middle = (from + to) / 2;
+    const half = Math.max((to - from) / 2, data.hop);
+    return [Math.max(0, middle - half), Math.min(LATEST, middle + half)];
+  }
+
+  // what is shown is kept in the address, `#secondary_2r.damping&last=600`: for reloads, links and the way back
+  const SELECTS = { overlay: "beside", scale: "as", under: "under" };
+  const initial = Object.fromEntries(Object.keys(SELECTS).map((id) => [id, at(id)?.value]));
+
+  function remember() {
+    const found = new URLSearchParams();
+    if (newestSeconds) found.set("last", newestSeconds);
+    else if (range) {
+      found.set("since", new Date(range[0] * 1e3).toISOString());
+      found.set("until", new Date(range[1] * 1e3).toISOString());
+    }
+    for (const [id, name] of Object.entries(SELECTS)) if (at(id) && at(id).value !== initial[id]) found.set(name, at(id).value);
+    const hash = `#${[encodeURIComponent(at("parameter").value), found].filter(String).join("&")}`;
+    if (hash === location.hash) return;
+    const same = hash.split("&")[0] === location.hash.split("&")[0]; // steps in time are no steps of the way back
+    history[same ? "replaceState" : "pushState"](null, "", hash);
+  }
+
+  function recall() {
+    const asked = new URLSearchParams(`parameter=${location.hash.slice(1)}`);
+    const name = asked.get("parameter") || data.first;
+    if (!data.parameters[name]) return;
+    at("parameter").value = name;
+    for (const [id, key] of Object.entries(SELECTS)) if (at(id)) {
+      at(id).value = asked.get(key) ?? initial[id];
+      if (at(id).selectedIndex < 0) at(id).value = initial[id];
+    }
+    newestSeconds = Math.max(0, Number(asked.get("last")) || 0);
+    const ends = ["since", "until"].map((key) => Date.parse(asked.get(key)) / 1e3);
+    range = ends.every(Number.isFinite) && ends[0] < ends[1] ? bounded(ends) : null;
+  }
 
   function chosen() {
     const name = at("parameter").value;
@@ -182,18 +228,19 @@
       draw: [(u) => lines(u, [{ y: shown[0].baseline, dash: [6, 4] }, { y: shown[0].nominal, dash: [2, 3] }])],
       setSelect: [(u) => {
         if (u.select.width < 5) return;
-        range = [u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")];
-        load();
+        show([u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]);
       }],
     };
     const cursor = { sync, drag: { x: true, y: false, setScale: false } };
-    const scales = range ? { x: { min: range[0], max: range[1] } } : {};
+    const wanted = span();
+    const scales = wanted ? { x: { min: wanted[0], max: wanted[1] } } : {};
     plots = [new uPlot({ width, height: 320, series, bands, hooks, cursor, scales, tzDate: utc, axes: axes(true, shown[0].unit) }, columns.slice(0, -1), at("plot"))];
     const lower = { label: "windows a point", stroke: style("--soft"), fill: style("--band"), paths: uPlot.paths.bars({ size: [1, 30] }) };
     plots.push(new uPlot({ width, height: 130, series: [series[0], lower], cursor, scales: { ...scales, y: { range: (_, low, most) => [0, Math.max(most, 1)] } }, tzDate: utc, axes: axes() }, [columns[0], columns.at(-1)], at("lower")));
-    plots.forEach((plot) => plot.over.addEventListener("dblclick", () => { range = null; load(); }));
+    plots.forEach((plot) => plot.over.addEventListener("dblclick", () => show(null)));
     const step = answer.resolution ? `one point is ${answer.resolution} s` : "single windows";
-    at("shown").textContent = `${time.length} points, ${step}`;
+    const nothing = wanted ? "no window in this range: “all” shows every one" : "no window yet";
+    at("shown").textContent = time.length ? `${time.length} points, ${step}` : nothing;
     table(shown, answer);
   }
 
@@ -246,8 +293,23 @@
     at("table").replaceChildren(made);
   }
 
-  async function load() {
+  // another range, or what else was chosen; seconds: up to the newest window
+  function show(wanted = range, seconds = 0) {
+    range = wanted && bounded(wanted);
+    newestSeconds = seconds;
+    remember();
+    load();
+  }
+
+  function load() {
     const number = ++request;
+    fetched(number).catch(() => { if (number === request) at("shown").textContent = "the service does not answer"; });
+  }
+
+  async function fetched(number) {
+    const range = span();
+    document.querySelectorAll("[data-range]").forEach((b) =>
+      b.setAttribute("aria-pressed", String(Number(b.dataset.range) === newestSeconds && !(range && !newestSeconds))));
     const names = chosen();
     const query = new URLSearchParams({ format: "columns" });
     names.forEach((name) => query.append("parameter", name));
@@ -278,6 +340,7 @@
 
   function choose(name) {
     at("parameter").value = name;
+    remember();
     load();
     at("history").scrollIntoView({ block: "start" });
   }
@@ -293,7 +356,13 @@
     const link = event.target.closest("a[data-element], a[data-parameter], a[data-sensor]");
     if (link) {
       event.preventDefault();
-      if (link.dataset.sensor) { at("sensor").value = link.dataset.sensor; newest(); at("sensors").scrollIntoView(); return; }
+      if (link.dataset.sensor) {
+        at("sensor").value = link.dataset.sensor;
+        if (at("sensor").selectedIndex < 0) at("sensor").selectedIndex = 0; // nothing came of it
+        else newest();
+        at("sensors").scrollIntoView();
+        return;
+      }
       const name = link.dataset.parameter || ofElement(link.dataset.element);
       if (name) choose(name);
       return;
@@ -301,25 +370,21 @@
     const button = event.target.closest("button");
     if (!button) return;
     if (button.dataset.use) { useModel(button.dataset.use); return; }
-    const [first, last] = range || (plots[0] ? [plots[0].data[0][0], plots[0].data[0].at(-1)] : [0, 0]);
-    if (button.dataset.range !== undefined) {
-      const seconds = Number(button.dataset.range);
-      const end = data.last ? data.last / 1e3 + data.hop : last;
-      range = seconds ? [end - seconds, end] : null;
-      document.querySelectorAll("[data-range]").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
-      load();
-    } else if (button.dataset.move) {
+    const [first, last] = span() || (plots[0]?.data[0].length ? [plots[0].data[0][0], plots[0].data[0].at(-1)] : []);
+    if (button.dataset.range !== undefined) show(null, Number(button.dataset.range));
+    else if (button.id === "fetchwindow") newest();
+    else if (first === undefined) return; // nothing is shown that could be moved
+    else if (button.dataset.move) {
       const by = Number(button.dataset.move) * (last - first);
-      range = [first + by, last + by];
-      load();
+      show([first + by, last + by]);
     } else if (button.dataset.zoom) {
       const middle = (first + last) / 2;
       const half = (Number(button.dataset.zoom) * (last - first)) / 2;
-      range = [middle - half, middle + half];
-      load();
-    } else if (button.id === "fetchwindow") newest();
+      show([middle - half, middle + half]);
+    }
   });
-  ["parameter", "overlay", "scale", "under"].forEach((id) => at(id)?.addEventListener("change", load));
+  ["parameter", "overlay", "scale", "under"].forEach((id) => at(id)?.addEventListener("change", () => { remember(); load(); }));
+  addEventListener("popstate", () => { recall(); load(); });
 
   function useModel(report) {
     at("usereport").value = report;
@@ -329,10 +394,11 @@
   let pair = [];
   async function newest() {
     at("windowstatus").textContent = "simulating …";
-    const answer = await fetch(`${base}/window`);
-    const found = await answer.json();
-    if (!answer.ok) { at("windowstatus").textContent = found.detail; return; }
+    const answer = await fetch(`${base}/window`).catch(() => null);
+    const found = await answer?.json().catch(() => null);
+    if (!answer?.ok || !found) { at("windowstatus").textContent = found?.detail || "the service does not answer"; return; }
     const sensor = found.sensors[at("sensor").value];
+    if (!sensor) { at("windowstatus").textContent = "no sensor of this vehicle has been heard yet"; return; }
     at("windowstatus").textContent = `window of ${found.start.slice(0, 19).replace("T", " ")}, ${found.adequate ? "fits" : found.reason || "does not fit"}`;
     pair.forEach((plot) => plot.destroy());
     at("compared").replaceChildren();
@@ -374,9 +440,8 @@
   news.onerror = () => { at("status").textContent = "Not connected; trying again"; };
   window.addEventListener("resize", () => plots.forEach((plot) => plot.setSize({ width: at("plot").clientWidth, height: plot.height })));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", load);
-  const wanted = decodeURIComponent(location.hash.slice(1));
-  if (data.parameters[wanted]) at("parameter").value = wanted;
-  else if (data.first) at("parameter").value = data.first;
-  if (wanted.startsWith("use=")) useModel(wanted.slice(4));
+  if (data.first) at("parameter").value = data.first;
+  recall();
+  if (location.hash.startsWith("#use=")) useModel(location.hash.slice(5));
   load();
 })();

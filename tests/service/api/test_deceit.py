@@ -38,6 +38,13 @@ def test_notes_may_have_lines_and_tabs_and_nothing_else_hidden(core: Core, clien
     assert client.post("/vehicles/a/notes", json={"text": "two\r\nlines\tand more"}).status_code == 201
 
 
+def test_people_are_told_which_character_is_hidden_and_where(core: Core, client: TestClient, system: System) -> None:
+    core.pipeline.process("a", [make_window(system, 0)])
+    told = client.post("/vehicles/a/notes", json={"text": "oil \u202echecked"}).json()["detail"]
+    assert told == "text: holds the hidden character U+202E at place 5; leave it out"
+    assert "128 characters" in client.patch("/vehicles/a", json={"label": "a" * 129}).json()["detail"]
+
+
 def test_an_upload_is_called_without_hidden_characters(core: Core, client: TestClient) -> None:
     name = "\x1b[31m\u202ea.csv"
     form = f'--b\r\nContent-Disposition: form-data; name="file"; filename="{name}"\r\n\r\nx\r\n--b--\r\n'.encode()

@@ -16,7 +16,7 @@ from sprung.service.pages.vehicle import sensor_marks
 from sprung.service.rendering.drawing import Mark
 from sprung.service.rendering.states import hints
 from sprung.service.store.fleet import AlarmRow
-from sprung.service.store.status import FleetRow
+from sprung.service.store.status import FleetRow, without_numbers
 
 SYSTEM = load_system()
 GAIN = Alarm("sensor", "bogie1_1l.gain", 0, 1, "warning", 0.05, 0.003)
@@ -108,3 +108,7 @@ def test_a_window_says_that_channels_are_missing_rather_than_that_the_vehicle_st
     moved = replace(stands, running=True, faults=silent)
     assert outcome_of(window, moved)[1] == "tells nothing without wheel_11l.displacement and 1 more, or at this speed"
     assert outcome_of(window, replace(moved, faults=()))[1] == NO_EXCITATION
+    exchanged = replace(moved, faults=(MeasurementFault("car_1l|car_1r", "swapped", 0.0),))
+    reason = outcome_of(window, exchanged)[1]
+    assert reason == "tells nothing without car_1l and 1 more, or at this speed"
+    assert without_numbers(reason) == "tells nothing without car_1l and others, or at this speed"

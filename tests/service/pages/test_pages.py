@@ -14,6 +14,7 @@ from sprung.model.tracking.state import Alarm
 from sprung.service.api.fleet import load_view
 from sprung.service.core import Core
 from sprung.service.monitoring.views import VehicleView
+from sprung.service.rendering.render import with_std
 from sprung.service.sources.live import FeedStatus
 from sprung.service.store import fleet, work
 from sprung.service.store.work import JobRow
@@ -96,6 +97,46 @@ def test_what_an_alarm_is_not_distinguished_from_stays_beside_it(client: TestCli
     assert alarm["alternatives"] == list(rivals)
     for page in ("/pages/vehicles/a", "/pages/alarms?active=false"):
         assert "bogie1_1l.gain or bogie1_1l.delay or " in client.get(page).text
+
+
+def test_an_alarm_of_a_sensor_leads_to_the_sensors_and_one_of_a_spring_to_its_history(
+    client: TestClient, core: Core
+) -> None:
+    with core.store.write() as connection:
+        fleet.ensure_vehicle(connection, "a", 1)
+        wrong = replace(FIRST, kind="sensor", parameter="bogie1_1l.gain", change=0.06)
+        fleet.save_alarms(connection, "a", core.pipeline.model_id, [FIRST, wrong])
+    page = client.get("/pages/vehicles/a").text
+    assert 'data-parameter="primary_11l.damping">history' in page
+    assert 'data-parameter="bogie1_1l.gain"' not in page and '<a href="#sensors">measured against simulated' in page
+
+
+@pytest.mark.parametrize(("path", "name"), [("/", "Fleet"), ("/pages/alarms", "Alarms"), ("/pages/work", "Work")])
+def test_people_are_told_where_they_are(client: TestClient, path: str, name: str) -> None:
+    assert re.findall(r'aria-current="page">(\w+)<', client.get(path).text) == [name]
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "unit", "text"),
+    [
+        (1_233_000.0, 14_460.0, "N/m", "1.233 ± 0.014 MN/m"),
+        (3632.0, 64.63, "N s/m", "3.632 ± 0.065 kN s/m"),
+        (464_700.0, 5413.0, "N/m", "464.7 ± 5.4 kN/m"),
+        (1_220_000.0, 610_000.0, "N/m", "1.22 ± 0.61 MN/m"),
+        (29_200.0, 410.0, "kg", "29200 ± 410 kg"),
+        (12.0, 0.0, "N/m", "12 N/m"),
+    ],
+)
+def test_a_value_and_its_deviation_have_one_unit(value: float, std: float, unit: str, text: str) -> None:
+    assert " ".join(filter(None, with_std(value, std, unit))) == text
+
+
+def test_jobs_that_wait_or_run_can_be_cancelled_where_they_are_listed(client: TestClient, core: Core) -> None:
+    with core.store.write() as connection:
+        for state in ("queued", "running", "done", "failed"):
+            work.add_job(connection, JobRow(state, "recording", state, None, None, 0.2, None, None, 1, 1))
+    offered = re.findall(r'data-post="/jobs/(\w+)/cancel"', client.get("/pages/work").text)
+    assert sorted(offered) == ["queued", "running"]
 
 
 def test_the_page_of_work_shows_live_buses_and_what_is_wrong_with_them(client: TestClient, core: Core) -> None:
