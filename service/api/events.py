@@ -6,14 +6,14 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator
-from typing import Annotated
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.api.access import CoreOf
 from sprung.service.api.actors import ClientOf
+from sprung.service.api.queries import OfVehicle
 from sprung.service.core import Core
 from sprung.service.monitoring.hub import Listener
 from sprung.service.times import optional_iso
@@ -30,9 +30,7 @@ ASK_SECONDS = 5.0  # between two looks whether whoever follows still may
     response_class=Response,
     responses={200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}}},
 )
-async def events(
-    request: Request, core: CoreOf, client: ClientOf, vehicle: Annotated[str | None, Query(max_length=128)] = None
-) -> Response:
+async def events(request: Request, core: CoreOf, client: ClientOf, vehicle: OfVehicle = None) -> Response:
     """Server-sent events `vehicle` with `{"vehicle", "window", "alarms"}`, at most one a second and vehicle.
 
     It ends when the token or session that it was begun with does.

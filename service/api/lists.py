@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
@@ -13,7 +13,7 @@ from sprung.model.diagnosis.investigation.verdict import Verdict
 from sprung.service.api import job_models, models
 from sprung.service.api.access import CoreOf, read
 from sprung.service.api.answers import json_response
-from sprung.service.api.queries import After, Limit, Since, time_of, with_cursor
+from sprung.service.api.queries import After, Limit, OfVehicle, Since, time_of, with_cursor
 from sprung.service.api.recordings import job_dict
 from sprung.service.core import Core
 from sprung.service.monitoring.views import alarm_dict
@@ -23,7 +23,6 @@ from sprung.service.store.fleet import WantedAlarms
 from sprung.service.times import optional_iso, to_iso
 
 router = APIRouter()
-OfVehicle = Annotated[str | None, Query(max_length=128)]
 
 
 @router.get("/alarms", summary="Alarms of the fleet", tags=["vehicles"], response_model=models.AlarmPage)

@@ -9,6 +9,7 @@ from typing import Annotated, TypeVar, get_args, get_origin
 from fastapi import Path, Query, Request
 from fastapi.routing import APIRoute
 
+from sprung.service.api.bodies import VehicleId
 from sprung.service.api.problems import ApiProblem
 from sprung.service.times import from_iso
 
@@ -17,6 +18,7 @@ UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 FOREVER = 2**63 - 1
 
 Id = Annotated[str, Path(alias="id", max_length=128, description="the vehicle, as recordings call it")]
+OfVehicle = Annotated[VehicleId | None, Query(description="of this vehicle only")]
 Version = Annotated[int, Path(ge=0, le=2**31 - 1, description="of the vehicle's model")]
 Limit = Annotated[int, Query(ge=1, le=1000, description="rows of one page")]
 After = Annotated[str | None, Query(max_length=200, description="`next` of the page before")]

@@ -31,7 +31,8 @@ INSIDE = re.compile(r"/(?![/\\])[!-\[\]-~]*")  # a path without blanks, backslas
 @pages.get("/signin")
 async def sign_in_page(core: CoreOf, to: Annotated[str, Query(max_length=500)] = "/") -> HTMLResponse:
     """A form for a token, and the way to the provider where there is one."""
-    return _form(core, _inside(to))
+    needed = core.oidc is not None or await run_in_threadpool(lambda: core.tokens.any)
+    return _form(core, _inside(to), needed=needed)
 
 
 @pages.post("/signin")
@@ -108,9 +109,10 @@ async def sign_out(request: Request, core: CoreOf) -> Response:
     return response
 
 
-def _form(core: Core, to: str, wrong: str = "", status: int = 200) -> HTMLResponse:
+def _form(core: Core, to: str, wrong: str = "", status: int = 200, needed: bool = True) -> HTMLResponse:
     headers = {"Retry-After": f"{AGAIN_SECONDS:.0f}"} if status == 503 else None
-    return HTMLResponse(render("signin.html", to=to, wrong=wrong, elsewhere=core.oidc is not None), status, headers)
+    page = render("signin.html", to=to, wrong=wrong, elsewhere=core.oidc is not None, needed=needed)
+    return HTMLResponse(page, status, headers)
 
 
 def _provider(core: Core) -> Provider:

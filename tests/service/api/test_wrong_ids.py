@@ -8,6 +8,8 @@ from urllib.parse import quote
 import pytest
 from fastapi.testclient import TestClient
 
+from sprung.service.api.bodies import VEHICLE_ID
+
 IDS = ("..", "../../etc/passwd", "%2f", "a\0b", "\u202eabc", "x" * 300, "-1", "9" * 30, "'; --", "<script>", "NaN", " ")
 BODIES = (b"", b"{}", b"[]", b'{"a": 1e400}', b"\xff\xfe")
 JSON = {"content-type": "application/json"}
@@ -42,3 +44,15 @@ def test_wrong_ids_and_bodies_are_problems_on_every_route(
             assert {"type", "title", "status", "detail"} <= answer.json().keys(), asked
             count += 1
     assert count > 200
+
+
+@pytest.mark.parametrize("path", ["/alarms", "/jobs", "/reports", "/recordings", "/events"])
+def test_a_vehicle_that_cannot_be_is_no_filter(client: TestClient, path: str) -> None:
+    """An empty list would say that such a vehicle has none."""
+    for one in (*IDS, "car 17", "Über", ""):
+        if VEHICLE_ID.fullmatch(one):
+            continue  # may be one
+        answer = client.get(path, params={"vehicle": one})
+        assert answer.status_code == 422 and "vehicle: " in answer.json()["detail"], (one, answer.text)
+    if path != "/events":
+        assert client.get(path, params={"vehicle": "nobody-1"}).status_code == 200

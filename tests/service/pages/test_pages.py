@@ -88,6 +88,18 @@ def test_a_page_of_alarms_behind_the_last_leads_back(client: TestClient, alarmed
         assert client.get(f"/pages/alarms?{wrong}").status_code == 422
 
 
+def test_a_page_of_the_fleet_behind_the_last_leads_back(client: TestClient, broken: str) -> None:
+    text = client.get("/?page=9&sort=id").text
+    assert "None on this page" in text and "No vehicle yet" not in text
+    assert 'href="/?sort=id" rel="prev"' in text
+
+
+def test_nobody_is_asked_for_a_token_before_there_is_one(client: TestClient, core: Core) -> None:
+    assert "nobody needs to sign in" in client.get("/signin").text
+    core.tokens.create("anna", ["read"])
+    assert 'name="token"' in client.get("/signin").text
+
+
 def test_what_an_alarm_is_not_distinguished_from_stays_beside_it(client: TestClient, core: Core) -> None:
     rivals = ("bogie1_1l.gain", "bogie1_1l.delay")
     with core.store.write() as connection:
