@@ -29,6 +29,7 @@ LOWEST_RATE = 1000.0  # bytes a second
 UNREAD_SECONDS = 60.0  # an answer may wait for the client to take what asyncio holds of it, some 64 kB
 STALLED_SECONDS = 2.0  # from then on a client that does not take its answer is one that only waits
 LINGER_SECONDS = 1.0  # that a refused client has to read why: closed at once, it would hear of a reset instead
+REST_SECONDS = 30.0  # for the rest of a body that nobody wants any more; many clients read only when they have sent all
 KERNEL_BYTES = 1 << 17  # of an answer that the kernel may hold for a client that takes nothing; else it is megabytes
 
 REFUSED = (
@@ -45,15 +46,35 @@ NO_HTTP_BODY = (
 )
 
 
+class LingeringTransport:
+    """A transport that closes when its client has sent what it is sending: the kernel resets a connection that is
+    closed on bytes which nobody has read, and with it the answer gets lost."""
+
+    def __init__(self, transport: asyncio.Transport, close: Callable[[], None]) -> None:
+        """close: called instead of the transport's own."""
+        self.transport = transport
+        self.close = close
+        self.closing = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.transport, name)
+
+    def is_closing(self) -> bool:
+        """Whether nothing is to be written any more."""
+        return self.closing or self.transport.is_closing()
+
+
 class GuardedProtocol(H11Protocol):
     """uvicorn's HTTP/1.1, admitted by a doorkeeper."""
 
     doorkeeper: Doorkeeper
-    _lingers: asyncio.TimerHandle | None = None  # of one that was refused: when it is closed all the same
+    transport: LingeringTransport  # type: ignore[assignment]  # that is all uvicorn asks of it
+    _lingers: asyncio.TimerHandle | None = None  # of one that is passed over: when it is closed all the same
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as in uvicorn
         """A client connects."""
         super().connection_made(transport)
+        self.transport = LingeringTransport(transport, self._close)
         self.host = client_of(self.client[0] if self.client else "")
         self.active = self._begun = time.monotonic()  # when something came; when the request that is awaited began
         self._received = 0
@@ -84,18 +105,33 @@ class GuardedProtocol(H11Protocol):
             self._begun, self._received = now, 0
         self.active = now
         self._received += len(data)
-        super().data_received(data)
+        if self._lingers is None:
+            super().data_received(data)
 
     def _refuse(self) -> None:
         """Say that there is no room, and why; what else comes is passed over until the client has read that."""
         self.transport.write(REFUSED % len(REFUSED_BODY) + REFUSED_BODY)
-        if self.doorkeeper.lingering >= MOST_LINGERING:
-            self.transport.close()
+        self._linger(LINGER_SECONDS)
+
+    def _close(self) -> None:
+        """Nothing more is answered; of a client in the midst of a body the rest is passed over before."""
+        if self.conn.their_state in (h11.SEND_BODY, h11.ERROR) and self._lingers is None:
+            self._linger(REST_SECONDS)
+        else:
+            self.transport.transport.close()
+
+    def _linger(self, seconds: float) -> None:
+        """Pass over what comes until the client closes, at most for so long."""
+        transport = self.transport.transport
+        if self.doorkeeper.lingering >= MOST_LINGERING or transport.is_closing():
+            transport.close()
             return
+        self.transport.closing = True
         self.doorkeeper.lingering += 1
-        self._lingers = self.loop.call_later(LINGER_SECONDS, self.transport.abort)
-        if self.transport.can_write_eof():
-            self.transport.write_eof()
+        self._lingers = self.loop.call_later(seconds, transport.abort)
+        if transport.can_write_eof():
+            transport.write_eof()
+        self.flow.resume_reading()
 
     def send_400_response(self, msg: str) -> None:
         """Answer malformed HTTP as problem+json, and close.
@@ -140,7 +176,7 @@ class GuardedProtocol(H11Protocol):
     @property
     def unsent(self) -> int:
         """Bytes of answers that the client has not read, without those in the kernel's buffer."""
-        return self.transport.get_write_buffer_size()
+        return self.transport.transport.get_write_buffer_size()
 
     @property
     def _at_rest(self) -> bool:
@@ -167,6 +203,8 @@ class GuardedProtocol(H11Protocol):
         if now - self.active > self.doorkeeper.body_idle_seconds:
             return True
         took = now - self._begun
+        if self.cycle is not None and self.cycle.response_complete and took > REST_SECONDS:  # since the answer
+            return True
         return took > RATE_AFTER_SECONDS and self._received < LOWEST_RATE * took
 
     def _untaken(self, now: float) -> bool:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import socket
 import time
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, suppress
+from http.client import HTTPConnection
 from pathlib import Path
 
 import pytest
 
+from sprung.service.api import server
 from sprung.service.api.server import STALLED_SECONDS
 from sprung.service.core import build_core
 from sprung.service.monitoring.engine import Engine
@@ -110,3 +113,33 @@ def test_what_is_given_up_does_not_stay_in_the_kernel(engine: Engine, data_dir: 
             while taken < 1_500_000:
                 taken += len(silent.recv(65536)) or 1_500_000
         assert taken < 400_000
+
+
+@pytest.mark.parametrize("chunked", [False, True], ids=["stated", "in chunks"])
+@pytest.mark.parametrize("path", ["/identify", "/vehicles/v/notes"])
+def test_who_sends_far_too_much_reads_why(engine: Engine, data_dir: Path, path: str, chunked: bool) -> None:
+    """It sends all before it reads: a connection that were closed meanwhile would be reset, and the answer lost."""
+    body: bytes | Iterator[bytes] = (b" " * 1_000_000 for _ in range(40)) if chunked else b" " * 40_000_000
+    with served(build_core(settings(data_dir), engine)) as port:
+        with closing(HTTPConnection("127.0.0.1", port, timeout=20)) as connection:
+            connection.request("POST", path, body, {"content-type": "application/json"}, encode_chunked=chunked)
+            answer = connection.getresponse()
+            assert answer.status == 413 and b"the body is longer than" in answer.read()
+        assert b"200 OK" in ask(port)
+
+
+def test_a_body_without_end_is_not_taken_for_ever(
+    engine: Engine, data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "REST_SECONDS", 2.0)
+    with served(build_core(settings(data_dir), engine)) as port, ExitStack() as stack:
+        for path, kind in (("/identify", "application/json"), ("/recordings", "application/json")):  # 413, 415
+            head = (
+                f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: {kind}\r\nTransfer-Encoding: chunked\r\n\r\n"
+            )
+            endless, begun = client(stack, port, "127.0.0.2", head.encode()), time.monotonic()
+            with suppress(ConnectionError):
+                while time.monotonic() < begun + 15:
+                    endless.sendall(b"10000\r\n" + b" " * 65536 + b"\r\n")
+                    time.sleep(0.01)
+            assert 1.5 < time.monotonic() - begun < 10, path
