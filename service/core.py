@@ -133,6 +133,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
     notices = Notices(settings, store, lambda: [feed.status() for feed in feeds])
     compute, beside = (Compute(settings.compute_queue, waits.of(queue)) for queue in ("numerics", "own models"))
     listeners: list[Callable[[Batch], None]] = []
+    housekeeping = Housekeeping(settings, store)
     pipeline = Pipeline(
         engine,
         store,
@@ -143,6 +144,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         follow=following,
         beside=beside,
     )
+    pipeline.aging = housekeeping.clock.read
     rings = Rings(settings.ring_vehicles, settings.ring_seconds, len(engine.system.channels), engine.system.sample_rate)
     rides, hub, alarm_signals = Rides(settings.parameter_series_vehicles), Hub(), AlarmSignals(settings, store, rings)
     metrics.registry.register(RideCollector(rides))
@@ -165,7 +167,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         diagnoses=diagnoses,
         diagnosis_jobs=diagnosis_jobs,
         alarm_signals=alarm_signals,
-        housekeeping=Housekeeping(settings, store),
+        housekeeping=housekeeping,
         hub=hub,
         condition=Condition(settings, store),
         operations=Operations(settings, pipeline, partial(_forget, (board, rides)), archive),

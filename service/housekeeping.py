@@ -58,9 +58,24 @@ class RetentionClock:
         self._wall = wall
         self._monotonic = monotonic
         self._last: tuple[int, _Mark] | None = None  # monotonic and what was known then
+        self._lock = threading.Lock()
 
-    def now(self, keep: bool = True) -> int:
-        """ns since epoch; keep: written down, so that the next process goes on from there."""
+    def now(self) -> int:
+        """ns since epoch; written down, so that the next process goes on from there."""
+        with self._lock:
+            mark = self._advanced()
+            try:
+                self._keep(mark)
+            except OSError as error:  # a full disk is no reason not to delete what is old
+                log.error("the clock of retention cannot be written down: %s", error)
+            return mark.time_ns
+
+    def read(self) -> int:
+        """ns since epoch; nothing is written down."""
+        with self._lock:
+            return self._advanced().time_ns
+
+    def _advanced(self) -> _Mark:
         wall, monotonic = self._wall(), self._monotonic()
         if self._last is not None:
             since, mark = self._last
@@ -68,12 +83,7 @@ class RetentionClock:
         else:
             mark = self._after_a_pause(wall)
         self._last = (monotonic, mark)
-        if keep:
-            try:
-                self._keep(mark)
-            except OSError as error:  # a full disk is no reason not to delete what is old
-                log.error("the clock of retention cannot be written down: %s", error)
-        return mark.time_ns
+        return mark
 
     def _keep(self, mark: _Mark) -> None:
         part = self._path.with_suffix(".part")

@@ -107,7 +107,7 @@ class IdempotentRequests:
         return self._response
 
     def _find(self) -> Row[Any] | None:
-        table, now = idempotency, self._core.housekeeping.clock.now(keep=False)
+        table, now = idempotency, self._core.housekeeping.clock.read()
         with self._core.store.write() as connection:
             connection.execute(delete(table).where(table.c.created_ns < now - KEPT))
             return connection.execute(select(table).where(table.c.key == self._key)).first()
@@ -128,7 +128,7 @@ class IdempotentRequests:
             "status": response.status_code,
             "body": json.loads(bytes(response.body)),
             "location": response.headers.get("location"),
-            "created_ns": self._core.housekeeping.clock.now(keep=False),
+            "created_ns": self._core.housekeeping.clock.read(),
         }
         try:
             connection.execute(insert(idempotency).values(**row))

@@ -17,7 +17,7 @@ def run(dry_run: bool, data_dir: Path | None, store: str | None) -> int:
     opened = open_store(settings.store_url, there=True)
     try:
         housekeeping = Housekeeping(settings, opened)
-        now = housekeeping.clock.now(keep=not dry_run)
+        now = housekeeping.clock.read() if dry_run else housekeeping.clock.now()
         found = housekeeping.once(now, keep=not dry_run)
     finally:
         opened.close()

@@ -52,18 +52,22 @@ def keep_changes(
     now: int,
     on_alarms: OnAlarms | None,
     recording_id: str | None = None,
+    aged: int | None = None,
 ) -> dict[str, VehicleView]:
     """Windows, roll-ups, trackers, alarms and lines of the fleet's list, each vehicle once; all of them are held.
+
+    now: the host's clock, ns; aged: that by which the windows age, where it is another.
 
     Returns how the vehicles are seen now.  on_alarms: None while nobody is to see anything of it
     (`service.store.staging`): only the history is kept then, and nothing is returned.
     """
+    aged = now if aged is None else aged
     stored = [VehicleWindows(one.vehicle, one.after.served.model_id, one.records) for one in changes if one.records]
     if stored:
-        add_windows(connection, stored, now, recording_id)
-        history.add_to_rollups(connection, stored, now)
+        add_windows(connection, stored, aged, recording_id)
+        history.add_to_rollups(connection, stored, aged)
     if on_alarms is not None:
-        add_circumstances(connection, {one.vehicle: one.ran for one in changes}, now)
+        add_circumstances(connection, {one.vehicle: one.ran for one in changes}, aged)
     fleet.save_trackers(connection, {(one.vehicle, one.after.served.model_id): one.row for one in changes}, now)
     for one in changes:
         found = fleet.save_alarms(connection, one.vehicle, one.after.served.model_id, one.after.state.alarms)

@@ -73,6 +73,7 @@ class Pipeline:
         self.pace = Pace()
         self._listeners = listeners
         self._clock = clock
+        self.aging = clock  # by which stored windows age; a service's is that of retention
         self._follow = follow
         self._on_alarms = on_alarms
         self._shown = staging is None
@@ -273,7 +274,7 @@ class Pipeline:
         tracked = time.perf_counter()
         changes = [change for *_, change in followed if change is not None]
         on_alarms = self._on_alarms if self._shown else None
-        views = keep_changes(connection, changes, now, on_alarms, recording_id) if changes else {}
+        views = keep_changes(connection, changes, now, on_alarms, recording_id, self.aging()) if changes else {}
         share = {"track": (tracked - started) / len(asked), "store": (time.perf_counter() - tracked) / len(asked)}
         return [
             self._folded(one, passed.records, after, dict(share), views.get(one.vehicle))

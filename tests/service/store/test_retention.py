@@ -10,6 +10,7 @@ from sqlalchemy import func, select
 
 from sprung.model.system import System
 from sprung.service.cli import retention as retention_command
+from sprung.service.core import Core
 from sprung.service.housekeeping import DAY, Housekeeping
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine
@@ -53,6 +54,32 @@ def test_the_clock_goes_on_with_time_but_takes_no_leap(tmp_path: Path) -> None:
     assert clock.now() == START + 2 * HOUR
     clocks.passed(3600, leap=-80 * DAY)
     assert clock.now() == START + 3 * HOUR
+
+
+def test_what_comes_while_the_clock_is_set_back_is_not_old_when_it_is_right_again(
+    engine: Engine, store: Store, compute: Compute, system: System, tmp_path: Path
+) -> None:
+    """Windows of a live bus are stamped by the host's clock: a wrong one makes them old by both."""
+    clocks = Clocks(START + 100 * DAY)
+    housekeeping = Housekeeping(Settings(data_dir=tmp_path), store)
+    housekeeping.clock = clocks.retention(tmp_path / "retention.json")
+    housekeeping.clock.now()
+    clocks.passed(60, leap=-100 * DAY)
+    pipeline = Pipeline(engine, store, compute, clock=lambda: clocks.wall)
+    pipeline.aging = housekeeping.clock.read
+    pipeline.process("a", [make_window(system, i) for i in range(20)])
+    clocks.passed(60, leap=100 * DAY)
+    assert housekeeping.once(housekeeping.clock.now()).windows == 0 and stored(store) == 20
+    clocks.passed(31 * 86_400)
+    assert housekeeping.once(housekeeping.clock.now()).windows == 20
+
+
+def test_the_service_stores_windows_by_the_clock_of_retention(core: Core, system: System) -> None:
+    clocks = Clocks(START + 5 * DAY)
+    vars(core.housekeeping.clock).update(_wall=lambda: clocks.wall, _monotonic=lambda: clocks.monotonic)
+    core.pipeline.process("a", [make_window(system, i) for i in range(3)])
+    with core.store.read() as connection:
+        assert set(connection.execute(select(windows.c.stored_ns)).scalars()) == {START + 5 * DAY}
 
 
 @pytest.mark.parametrize(("leap", "advance"), [(40 * DAY, DAY), (5500 * DAY, DAY), (-9000 * DAY, 0), (HOUR, HOUR)])
