@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 from scipy.linalg import expm
-from scipy.signal import decimate
+from scipy.signal import butter, decimate, resample_poly, sosfiltfilt
 
 from sprung.benchmarks.cars import EFFECTS, HUBS, recorded
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
@@ -86,6 +86,15 @@ sensors:
   a1: {kind: acceleration, body: f1, csv: a1, noise: 0.003}
   b1: {kind: acceleration, body: f1, csv: b1, noise: 0.003}
   a2: {kind: acceleration, body: f2, csv: a2, noise: 0.003}
+"""
+STOREY = """
+name: storey
+sample_rate: 100
+window: 1000
+bodies: {floor: {mass: 1000}}
+inputs: {base: {kind: support, acceleration: {csv: g, noise: 0.005}}}
+elements: {storey: {upper: floor, lower: base, stiffness: 1.15e6, damping: 3.9e3}}
+sensors: {a: {kind: acceleration, body: floor, csv: a, noise: 0.005}}
 """
 FRAME = """
 name: frame
@@ -208,6 +217,7 @@ def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[t
     yield "shaken, exchanged", partial(_made, SHAKEN, shaken, seed + 3)
     yield "accelerations", partial(_on_hubs, seed + 4)
     yield "frame", partial(_made, FRAME, frame, seed + 6)
+    yield "joint", partial(_made, STOREY, storey, seed + 7)
 
 
 def _made(text: str, make: Callable[..., FalsifiedRecording], seed: int, *more: float) -> Made:
@@ -280,13 +290,51 @@ class Imperfect:
     fall: float = 0.0  # of the friction with the rate
     late: float = 0.0  # s, of the force's channel
     rubs: bool = True
+    joint: float = 0.0  # N, of sliders that slip one after the other
+    quadratic: float = 0.0  # N s^2/m^2
+    wrong: tuple[tuple[float, FloatArray], ...] = ()  # when, of the test, and errors of values in a row, N
 
 
 IMPERFECT = {
     "falling friction": Imperfect(fall=0.6),
     "one loop": Imperfect(((0.012, 1.0, 0.3),)),
     "late": Imperfect(late=0.03, rubs=False),
+    "joint": Imperfect(rubs=False, joint=300.0),
+    "quadratic beside friction": Imperfect(quadratic=3e3),
+    "wrong values": Imperfect(wrong=((0.2, np.array([1500.0])), (0.5, np.array([1200.0, 900.0])))),
 }
+
+
+class Sliders:
+    """A lap joint (Iwan): sliders that slip one after the other, more of them the further."""
+
+    def __init__(self, stiffness: float, force: float, count: int = 30) -> None:
+        """stiffness: of all, N/m; force: of all as they slip, N."""
+        share = np.linspace(0, 1, count + 1)
+        self.stiffness, middle = stiffness * np.diff(np.sqrt(share)), share[1:] - 0.5 / count
+        self.reach = force / float(self.stiffness @ middle) * middle
+        self.held, self.last = np.zeros(count), 0.0
+
+    def force(self, d: float) -> float:
+        """Force at the next deflection, N."""
+        self.held, self.last = np.clip(self.held + (d - self.last), -self.reach, self.reach), d
+        return float(self.stiffness @ self.held)
+
+
+def storey(random: np.random.Generator, seconds: float = 40.0, count: int = 30) -> FalsifiedRecording:
+    """A floor on a spring, a damper and a lap joint, on ground that shakes; with one slider, a spring that slips."""
+    finer = 10
+    steps, step = round(seconds * RATE) * finer, 1 / (RATE * finer)
+    band = butter(2, [0.4, 8.0], "bandpass", fs=RATE * finer, output="sos")
+    ground = sosfiltfilt(band, random.standard_normal(steps + 2000 * finer))[1000 * finer : -1000 * finer]
+    ground *= 1.5 / np.std(ground)
+    joint, floor, d, v = Sliders(6e5, 1500.0, count), np.empty(steps), 0.0, 0.0
+    for i, base in enumerate(ground.tolist()):
+        floor[i] = -(1e6 * d + 3e3 * v + joint.force(d)) / 1e3
+        v += step * (floor[i] - base)
+        d += step * v
+    shown = resample_poly(np.column_stack([ground, floor]), 1, finer)
+    return FalsifiedRecording("", frozenset(), shown + 0.005 * random.standard_normal(shown.shape))
 
 
 def rig(random: np.random.Generator, seconds: float, imperfect: Imperfect = Imperfect()) -> FalsifiedRecording:
@@ -298,7 +346,14 @@ def rig(random: np.random.Generator, seconds: float, imperfect: Imperfect = Impe
     v = sum((size * 2 * np.pi * f * np.cos(2 * np.pi * f * t + phase) for size, f, phase in sines), start=still)
     falls = imperfect.rubs * (1 + imperfect.fall * (np.exp(-((v / 0.02) ** 2)) - 1))
     force = 3.6e4 * d + 1.3e3 * v + random.uniform(40.0, 160.0) * falls * np.tanh(v / 1e-3)
+    force += imperfect.quadratic * v * np.abs(v)
+    if imperfect.joint:
+        joint = Sliders(6e4, imperfect.joint)
+        force += [joint.force(float(at)) for at in d]
     noise = random.standard_normal((2, len(t)))
+    for share, errors in imperfect.wrong:
+        at = int(share * len(t))
+        force[at : at + len(errors)] += errors
     if imperfect.late:
         t = t + imperfect.late
         d = np.sum([size * np.sin(2 * np.pi * f * t + phase) for size, f, phase in sines], axis=0)

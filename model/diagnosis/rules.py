@@ -393,6 +393,12 @@ class VerdictRules:
         0.02, "of the excess error, that one of them and values that are off may leave; chosen", 0.01, 0.05
     )
     slack: float = rule(1.5, "times a declared noise; chosen: a declaration is a round number", 1.2, 2.0)
+    imitated: float = rule(
+        0.01, "of the excess error, that laws may leave as a force of the motion; chosen: 10 % of a force", 0.005, 0.02
+    )
+    another_force: float = rule(
+        0.5, "of what laws leave, left beside an unnamed force that they lack; chosen: most of it", 0.3, 0.7
+    )
 
 
 @dataclass(frozen=True)

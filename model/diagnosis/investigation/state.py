@@ -180,7 +180,8 @@ class Judgement:
     nothing_fits: bool  # whether the model is rejected, or most is left of what is not known by phase
     parts: int  # number of structural changes, if too many to be plausible; else 0
     ended: str  # "budget of work" or "limit of time" that ended the search; else empty
-    carried: bool  # whether the findings explain more than they leave
+    carried: bool  # whether the findings explain more than they leave, and imitate no other force
+    imitated: str  # the place of a law that imitates another force; else empty
     place: str  # of most of the misfit
     where: str  # the same in words, with size and frequencies; empty without misfit
 

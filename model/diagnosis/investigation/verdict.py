@@ -75,14 +75,16 @@ def verdict_of(
     rules: VerdictRules = RULES.verdict,
     *,
     other_structure: bool = False,
+    imitated: bool = False,
     ended: bool = False,
 ) -> Verdict:
     """The verdict for findings of the given kinds, best first, and the errors that they leave.
 
     other_structure: the findings imitate another structure than the system file's.
+    imitated: a law among them imitates another force.
     ended: the search ended at its limit, so that effects may have been missed.
     """
-    if other_structure:
+    if other_structure or imitated:
         return "unknown_physics"
     kinds = [kind for kind in kinds if kind is not EffectKind.NUISANCE]
     physics = [kind for kind in kinds if kind is not EffectKind.FAULT]

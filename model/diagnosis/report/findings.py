@@ -51,10 +51,12 @@ def _unknown_finding(outcome: Outcome) -> Finding:
     state, judgement = outcome.investigation, outcome.judgement
     here = [candidate for candidate in state.last.candidates if candidate.location == judgement.place]
     best = max(here, key=lambda candidate: candidate.score, default=None)
-    tried = ""
+    tried, place = "", judgement.imitated.replace("|", " and ")
     if state.found:
         names = " and ".join(f.trial.term.law.name.replace("_", " ") for f in state.found)
         tried = f"; {names} would explain too little of it"
+        if judgement.imitated:
+            tried = f"; {names} would come closest, but what is left then is itself a force of {place}'s motion"
     left = f"a misfit that no law explains: {judgement.where}" if judgement.where else "candidates that were not fitted"
     return Finding(
         location=judgement.place,

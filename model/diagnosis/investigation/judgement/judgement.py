@@ -8,6 +8,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.configuration.effects import WRONG_BODY
+from sprung.model.diagnosis.investigation.judgement.imitated import imitated
 from sprung.model.diagnosis.investigation.measurements.calibration import faulty
 from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
 from sprung.model.diagnosis.investigation.measurements.floor import bounded, held_out_errors
@@ -57,7 +58,10 @@ def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgemen
     deciding = _deciding_errors(state, errors, runs.noise, lost=lost)
     faults, physics = _kinds_of_faults(state, runs.noisy), _kinds_of_physics(state)
     other = another_structure(state, deciding)
-    verdict = verdict_of(faults + physics, deciding, rules, other_structure=other, ended=bool(ended))
+    place = "" if other else imitated(state, deciding)
+    verdict = verdict_of(
+        faults + physics, deciding, rules, other_structure=other, imitated=bool(place), ended=bool(ended)
+    )
     error, unknown = float(np.sqrt(np.mean(deciding.after**2))), verdict == "unknown_physics"
     rejected = bool(other) or (unknown and error > rules.rejected)
     return Judgement(
@@ -69,10 +73,11 @@ def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgemen
         lost_phase=lost,
         nothing_fits=rejected or (unknown and lost and error**2 > rules.gross),
         parts=changed_parts(state) + _out_of_order(state) if other else 0,
-        carried=_carries(verdict, physics),
+        carried=_carries(verdict, physics) and not place,
+        imitated=place,
         ended=ended,
-        place=_place(state),
-        where=_words(state, errors, runs.after),
+        place=place or _place(state),
+        where=_words(state, errors, runs.after, place or _place(state)),
     )
 
 
@@ -167,7 +172,7 @@ def _place(state: Investigation) -> str:
     return max(here, key=lambda candidate: candidate.score).location if here else next(iter(state.system.elements), "")
 
 
-def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun) -> str:
+def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun, place: str) -> str:
     """Place, size and frequencies of the misfit, in words; empty without misfit."""
     left = errors.unexplained(state.options.rules.verdict)
     if not np.any(left > 0):
@@ -178,7 +183,7 @@ def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun) -> str:
     return (
         f"{100 * errors.after[worst]:.0f} % of {state.signals.sensor_names[worst]} "
         f"({100 * errors.floor[worst]:.1f} % is noise), most of it at {low:.2g} to {high:.2g} Hz; "
-        f"most suspicious is {_place(state).replace('|', ' and ')}"
+        f"most suspicious is {place.replace('|', ' and ')}"
     )
 
 

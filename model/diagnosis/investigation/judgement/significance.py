@@ -24,23 +24,26 @@ from sprung.model.diagnosis.investigation.search.redundant import without
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.terms import Term, evaluated_in_time
 from sprung.model.diagnosis.selection.compete import noise_bound
-from sprung.model.diagnosis.selection.plausible import hardly_there
+from sprung.model.diagnosis.selection.plausible import hardly_there, out_of_range
 from sprung.model.signals import FloatArray
 
 _STEPS = 10  # of a fit from a close start
 
 
 def without_insignificant(state: Investigation) -> Investigation:
-    """The investigation without findings whose values do not differ significantly from those of an absent law."""
+    """The investigation without findings that are not significant, or whose last values are not plausible.
+
+    Insignificant is one whose values do not differ from those of an absent law.
+    """
     if not state.found:
         return state
     state = _with_centred_gains(state)
     stated = replace(state.fit, covariance=_reported_covariance(state))
     for index in reversed(range(len(state.found))):
         at = state.given + index
-        if not within_tolerance(state, stated.point.terms[at]) and hardly_there(
-            stated, state.options.rules.plausible, at
-        ):
+        term, rules = stated.point.terms[at], state.options.rules.plausible
+        doubted = hardly_there(stated, rules, at) or out_of_range(term) is not None
+        if doubted and not within_tolerance(state, term):
             other = without(state, index)
             if other is not None:
                 return without_insignificant(other)
