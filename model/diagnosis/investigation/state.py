@@ -172,6 +172,7 @@ class Judgement:
     """Judgement of an investigation."""
 
     errors: HeldOutErrors  # of the held-out part, per sensor
+    reported: HeldOutErrors  # what is explained and left: these, or shares of forces if the phase is lost
     verdict: Verdict
     floor: FloatArray  # bounded noise, in the sensors' units, (S,)
     error: float  # of the model over the signal; if its phase is lost, of unmeasured over inertia forces

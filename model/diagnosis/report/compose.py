@@ -40,9 +40,10 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
     if judgement.ended:
         advice.insert(0, search_ended(judgement.ended))
     rules = state.options.rules.verdict
-    explained = judgement.errors.explained(rules) if state.found else None
-    left = judgement.errors.unexplained(rules)
-    unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), judgement.where)
+    explained = judgement.reported.explained(rules) if state.found else None
+    left = judgement.reported.unexplained(rules)
+    per_sensor = {} if judgement.lost_phase else dict(zip(names, left.tolist(), strict=True))
+    unexplained = Unexplained(float(np.mean(left)), per_sensor, judgement.where)
     return Report(
         system=state.system.name,
         recording=RecordingFacts(

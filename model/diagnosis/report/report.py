@@ -149,7 +149,10 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """Share of the held-out measured variance that neither the model nor bounded noise explains."""
+    """Share of the held-out measured variance that neither the model nor bounded noise explains.
+
+    If the free run loses its phase, of unmeasured forces in the inertia forces, and of no sensor.
+    """
 
     share: float = 0.0  # mean over sensors
     per_sensor: Mapping[str, float] = field(default_factory=dict)

@@ -66,6 +66,7 @@ def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgemen
     rejected = bool(other) or (unknown and error > rules.rejected)
     return Judgement(
         errors=errors,
+        reported=deciding if lost else errors,
         verdict=verdict,
         floor=runs.floor,
         error=error,
@@ -77,7 +78,7 @@ def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgemen
         imitated=place,
         ended=ended,
         place=place or _place(state),
-        where=_words(state, errors, runs.after, place or _place(state)),
+        where=_words(state, deciding if lost else errors, None if lost else runs.after, place or _place(state)),
     )
 
 
@@ -172,19 +173,22 @@ def _place(state: Investigation) -> str:
     return max(here, key=lambda candidate: candidate.score).location if here else next(iter(state.system.elements), "")
 
 
-def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun, place: str) -> str:
-    """Place, size and frequencies of the misfit, in words; empty without misfit."""
+def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun | None, place: str) -> str:
+    """Place, size and frequencies of the misfit, in words; empty without misfit.
+
+    after: the free run of the errors; None: they are unmeasured forces over the inertia forces.
+    """
     left = errors.unexplained(state.options.rules.verdict)
     if not np.any(left > 0):
         return ""
     worst = int(np.argmax(left))
-    error = after.measured[:, worst] - after.simulated[:, worst]
-    low, high = main_band(error, state.signals.sample_rate)
-    return (
-        f"{100 * errors.after[worst]:.0f} % of {state.signals.sensor_names[worst]} "
-        f"({100 * errors.floor[worst]:.1f} % is noise), most of it at {low:.2g} to {high:.2g} Hz; "
-        f"most suspicious is {place.replace('|', ' and ')}"
-    )
+    size, noise = 100 * errors.after[worst], f"({100 * errors.floor[worst]:.1f} % is noise)"
+    suspect = f"most suspicious is {place.replace('|', ' and ')}"
+    if after is None:
+        return f"unmeasured forces of {size:.0f} % of the inertia forces {noise}; {suspect}"
+    low, high = main_band(after.measured[:, worst] - after.simulated[:, worst], state.signals.sample_rate)
+    sensor = state.signals.sensor_names[worst]
+    return f"{size:.0f} % of {sensor} {noise}, most of it at {low:.2g} to {high:.2g} Hz; {suspect}"
 
 
 def main_band(error: FloatArray, sample_rate: float) -> tuple[float, float]:
