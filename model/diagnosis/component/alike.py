@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 from sprung.model.diagnosis.component.drifting import with_drift_instead
 from sprung.model.diagnosis.force.deviations import moved_in_common
-from sprung.model.diagnosis.force.fit import ComponentFit, refined
-from sprung.model.diagnosis.force.lag import Lag
+from sprung.model.diagnosis.force.fit import ComponentFit, fitted, refined
+from sprung.model.diagnosis.force.lag import LAGS, Lag
 from sprung.model.diagnosis.force.low_valve import low_valve
 from sprung.model.diagnosis.force.parts import Part
 from sprung.model.diagnosis.force.piece import Piece
+from sprung.model.diagnosis.force.pieces import INERTIA
 from sprung.model.diagnosis.force.ranking import Step, plausible
 from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 from sprung.model.signals import FloatArray
@@ -56,7 +57,28 @@ def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple
                 found += (
                     [one] if other.evidence > near or (plausible(one.fit, index) and _as_well(one.fit, here)) else []
                 )
+        early = _early_instead(here, index)
+        if early is not None and _as_well(early, here):
+            one = EquivalentModel(index, early, here)
+            found += [one] if all((other.index, other.effect) != (index, one.effect) for other in found) else []
     return tuple(found)
+
+
+def _early_instead(fit: ComponentFit, index: int) -> ComponentFit | None:
+    """The fit with an inertia in place of a force that comes early, or the reverse; None in place of other laws.
+
+    A damper's force that comes early differs by damping x acceleration for every second, to first order in the time.
+    It is tried although an inertance as small as that may not be determined: its motion is differentiated twice.
+    """
+    task, model, piece = fit.task, fit.model, fit.model.pieces[index]
+    if isinstance(piece, Lag) and not piece.filters and model.shapes[index][0] < 0:
+        return refined(task, model.replaced(index, INERTIA, ()))
+    if piece is not INERTIA or any(isinstance(one, Lag) for one in model.pieces):
+        return None
+    delay, *_ = LAGS
+    early = [(float(time),) for time in delay.grid(task.seen)[:, 0] if time < 0]
+    fits = (fitted(task, model.replaced(index, delay, shape)) for shape in early)
+    return refined(task, min(fits, key=lambda one: one.error).model)
 
 
 def gives_way(final: ComponentFit, piece: Part) -> bool:

@@ -31,7 +31,7 @@ def _drift(law: ElementLaw, quantity: str) -> Piece:
     )
 
 
-_INERTIA = InertiaPiece(INERTER, signs=(1,), parameters=lambda a, s, e: (a[0],))
+INERTIA = InertiaPiece(INERTER, signs=(1,), parameters=lambda a, s, e: (a[0],))
 
 PIECES: tuple[Piece, ...] = (
     *FRICTION_PIECES,
@@ -39,5 +39,5 @@ PIECES: tuple[Piece, ...] = (
     *STIFFNESS_PIECES,
     _drift(TIME_VARYING_STIFFNESS, "stiffness"),
     _drift(TIME_VARYING_DAMPING, "damping"),
-    _INERTIA,
+    INERTIA,
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from sprung.model.diagnosis.component.alike import gives_way
 from sprung.model.diagnosis.force.fit import NO_LAWS, ComponentTask, fitted
@@ -12,6 +13,9 @@ from sprung.model.diagnosis.force.motion import element_motion
 from sprung.model.diagnosis.force.piece import Piece
 from sprung.model.diagnosis.force.pieces import PIECES
 from sprung.model.diagnosis.force.pieces_damping import LOW_VALVE
+from tests.diagnosis.component.rigs import C, K, diagnosed, moved, recorded
+from tests.diagnosis.component.test_component import RATE as RIG_RATE
+from tests.diagnosis.component.test_component import RigRecording
 
 STOP = next(piece for piece in PIECES if piece.key == "bump_stop 2")
 RATE = 200.0
@@ -28,3 +32,23 @@ def test_a_late_force_beside_a_valve_may_be_oil_that_gives_way(piece: Piece | No
     fit = fitted(task, model if piece is None else model.plus(piece, (shape,)))
     assert gives_way(fit, LAGS[0]) == either
     assert piece is None or not gives_way(fit, piece)
+
+
+@pytest.mark.parametrize("mass", [0.4, 2.0])  # kg
+@pytest.mark.parametrize("clamped", [True, False])
+def test_a_light_clamp_and_a_force_that_comes_early_are_told_as_alternatives(mass: float, clamped: bool) -> None:
+    """Beside a damper both are a force in proportion to the acceleration, to first order in the time."""
+    motion, noise = moved("random", 3), 0.003
+    time = np.arange(len(motion)) / RIG_RATE
+    exact = CubicSpline(time, motion)
+    values = recorded(lambda d, v: np.zeros_like(d), motion, noise).values
+    if clamped:
+        values[:, 1] += mass * exact(time, 2)
+    else:
+        early = K * exact(time + mass / C) + C * exact(time + mass / C, 1)
+        values[:, 1] = early + noise * np.std(early) * np.random.default_rng(5).standard_normal(len(time))
+    report = diagnosed(RigRecording(values), noise)
+    (finding,) = report.findings
+    told = set((finding.family or finding.effect).split(" or "))
+    assert ("inerter" if clamped else "sensor_lag") in told, report.summary
+    assert told <= {"inerter", "sensor_lag"}
