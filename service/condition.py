@@ -15,6 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sprung.model.text import first_line
 from sprung.service.settings import Settings
 from sprung.service.store import Store
+from sprung.service.store.engine import LITTLE_BYTES
 
 FRESH_SECONDS = 1.0  # that an answer is given again: asking costs a transaction
 DESCRIPTORS = 8  # that must be left
@@ -58,9 +59,15 @@ class Condition:
             free = free_bytes(folder)
         except OSError as error:
             return [f"{folder}: {error.strerror or error}"]
-        if free < self._settings.min_free_bytes:
-            return [f"{folder}: {free / 1e6:.0f} MB are free, {self._settings.min_free_bytes / 1e6:.0f} MB are needed"]
-        return []
+        found = _room_trouble(folder, free, self._settings.min_free_bytes)
+        place = self._store.folder
+        if place is not None and place.stat().st_dev != folder.stat().st_dev:
+            found += _room_trouble(place, free_bytes(place), LITTLE_BYTES)
+        return found
+
+
+def _room_trouble(folder: Path, free: int, needed: int) -> list[str]:
+    return [f"{folder}: {free / 1e6:.0f} MB are free, {needed / 1e6:.0f} MB are needed"] if free < needed else []
 
 
 def _memory_trouble() -> str:

@@ -142,7 +142,7 @@ class Guard:
             self._check_scope(actor, need, path)
         except ApiProblem as problem:
             page = wants_page(scope["method"], headers)
-            response = problem_page(problem) if page else problem_response(problem, path)
+            response = problem_page(problem, path) if page else problem_response(problem, path)
             if problem.status == 401 and page:
                 response.status_code = 303
                 response.headers["location"] = f"/signin?to={quote(path)}"

@@ -71,14 +71,14 @@ def wants_page(method: str, headers: Mapping[str, str]) -> bool:
     return method in ("GET", "HEAD") and "text/html" in accepted and "application/json" not in accepted
 
 
-def problem_page(problem: ApiProblem) -> Response:
-    """The same answer as a page: the error, and a link back."""
+def problem_page(problem: ApiProblem, instance: str) -> Response:
+    """The same answer as a page: the error, and a link back; as for programs where no file can be read any more."""
     title = HTTPStatus(problem.status).phrase
-    return HTMLResponse(
-        render("problem.html", title=title, status=problem.status, detail=problem.detail),
-        problem.status,
-        {"X-Content-Type-Options": "nosniff"} | problem.headers,
-    )
+    try:
+        page = render("problem.html", title=title, status=problem.status, detail=problem.detail)
+    except (OSError, MemoryError):
+        return problem_response(problem, instance)
+    return HTMLResponse(page, problem.status, {"X-Content-Type-Options": "nosniff"} | problem.headers)
 
 
 def from_validation(error: ValidationError, prefix: str = "") -> ApiProblem:
@@ -118,7 +118,7 @@ def install(app: FastAPI) -> None:
         if problem.status == 405:
             problem.headers["Allow"] = ", ".join(_methods(app, request))
         if wants_page(request.method, request.headers):
-            return problem_page(problem)
+            return problem_page(problem, request.url.path)
         return problem_response(problem, request.url.path)
 
     for kind in (*EXPECTED, Exception):

@@ -202,6 +202,18 @@ class Batcher:
         """One batch; runs in the numerics' thread."""
         with self._lock:
             batch = self._waiting.take(lambda one: self._pipeline.pace.windows(one.sent.served, TOGETHER))
+        try:
+            self._identify_together(batch)
+        except BaseException as error:  # no memory, or none for another thread: who waits hears of it, and others go on
+            for request in batch:
+                request.answer = error
+        with self._lock:
+            self._called = False
+            refused = self._call_in_time()
+        _deliver([*refused, *(request for request in batch if not _to_be_tracked(request))])
+
+    def _identify_together(self, batch: Sequence[_Request]) -> None:
+        """Estimates of a batch, and those to be tracked handed over; all of them, or none where this raises."""
         now = time.perf_counter()
         alike: dict[tuple[int, bool, bool], list[_Request]] = {}
         for request in batch:
@@ -212,10 +224,6 @@ class Batcher:
         for together in alike.values():
             self._estimate(together)
         self._track([request for request in batch if _to_be_tracked(request)])
-        with self._lock:
-            self._called = False
-            refused = self._call_in_time()
-        _deliver([*refused, *(request for request in batch if not _to_be_tracked(request))])
 
     def _estimate(self, batch: Sequence[_Request]) -> None:
         """Windows that are asked about in the same way."""
@@ -246,10 +254,10 @@ class Batcher:
         for request in requests:
             request.handed = now
         with self._lock:
-            self._to_track.extend(requests)
             if not self._tracking:
+                self._tracker.submit(self._keep)  # raises where its thread cannot be started
                 self._tracking = True
-                self._tracker.submit(self._keep)
+            self._to_track.extend(requests)
 
     def _keep(self) -> None:
         """All that wait to be tracked, in one transaction; runs in the tracking thread."""
@@ -260,9 +268,13 @@ class Batcher:
             refused = self._call_in_time()
         _deliver(refused)
         now = time.perf_counter()
-        for request in batch:
-            self._observe({"track queue": now - request.handed})
-        self._keep_together(batch)
+        try:
+            for request in batch:
+                self._observe({"track queue": now - request.handed})
+            self._keep_together(batch)
+        except BaseException as error:  # as above: no memory
+            for request in batch:
+                request.answer = error
         _deliver(batch)
 
     def _keep_together(self, batch: Sequence[_Request]) -> None:

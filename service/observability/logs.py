@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import re
 import sys
+from asyncio import CancelledError
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any
@@ -58,6 +60,7 @@ def _plain(value: Any) -> str:
     return text if WORD.fullmatch(text) else json.dumps(text)
 
 
+SHORTAGES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS)  # of the machine
 LOGGED = "sprung_logged"  # attribute of an exception that is in the log already
 
 
@@ -67,10 +70,20 @@ def untold(record: logging.LogRecord) -> bool:
     return not getattr(error, LOGGED, False)
 
 
+def foreseen(record: logging.LogRecord) -> bool:
+    """Whether an exception is to be logged, and in a line where it is no fault of the program: connections that are not
+    accepted for want of files or memory; requests that are given up at the end are counted by the server."""
+    error = record.exc_info[1] if record.exc_info else None
+    if isinstance(error, OSError) and error.errno in SHORTAGES and record.name == "asyncio":
+        record.msg, record.args, record.exc_info = f"no connection is accepted: {error.strerror}", None, None
+    return not isinstance(error, CancelledError)
+
+
 def set_up(form: str, level: str) -> None:
     """Log to stderr; form: text or json."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines() if form == "json" else PlainLines())
     handler.addFilter(untold)
+    handler.addFilter(foreseen)
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("sprung").setLevel(level.upper())

@@ -6,6 +6,7 @@ reads a vehicle's tracker to write it holds the vehicle's row (`fleet.hold_vehic
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one
 PROBE_SECONDS = 2.0
 KEPT_READERS, MOST_READERS = 8, 32  # connections to SQLite that stay open; more while as many requests read at once
 MOST_WRITERS = 10  # transactions of one process at once on PostgreSQL; others wait
+LITTLE_BYTES = 4_000_000  # free on a disk: SQLite's write-ahead log grows to this
 STATEMENT_MILLISECONDS = 60_000  # a statement that takes longer is given up: its caller tries again
 UPSERT_DIALECTS = ("sqlite", "postgresql")
 
@@ -42,6 +44,12 @@ class Store:
         self.write_lock = WriteLock(MOST_WRITERS if self.many_writers else 1)
         self.on_wait: Callable[[float], None] = lambda seconds: None  # takes each transaction's wait to write
         self.months: set[str] = set()  # partitions that are known to be there (`partitions.prepare`)
+
+    @property
+    def folder(self) -> Path | None:
+        """Where an SQLite store lies; None for one on a server."""
+        url = self.engine.url
+        return Path(url.database or "").expanduser().parent if url.get_backend_name() == "sqlite" else None
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
@@ -122,7 +130,7 @@ def open_store(url: str, migrated: bool = False, *, there: bool = False) -> Stor
     except (ArgumentError, NoSuchModuleError) as error:
         raise UserError(f"store {shown}: not a usable database URL ({first_line(error)})") from error
     except (DatabaseError, OSError) as error:
-        raise UserError(f"store {shown}: cannot be opened ({first_line(error)})") from error
+        raise UserError(f"store {shown}: cannot be opened ({first_line(error)}{_full(parsed)})") from error
     return store
 
 
@@ -174,6 +182,17 @@ def _postgresql_engine(url: URL) -> Engine:
 def _json(value: Any) -> str:
     """A tracker's state is 80 kB: `json.dumps` takes five times as long."""
     return to_json(value).decode()
+
+
+def _full(url: URL) -> str:
+    """What SQLite does not say of a disk that has no room for its shared memory: "disk I/O error" is all that comes."""
+    if url.get_backend_name() != "sqlite":
+        return ""
+    try:
+        free = shutil.disk_usage(Path(url.database or "").expanduser().parent).free
+    except OSError:
+        return ""
+    return f"; {free / 1e6:.1f} MB are free on its disk" if free < LITTLE_BYTES else ""
 
 
 def _sqlite_engine(url: str, database: str | None) -> Engine:

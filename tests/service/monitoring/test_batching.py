@@ -20,7 +20,8 @@ from sqlalchemy.exc import OperationalError
 from sprung.model.system import System
 from sprung.service.api.problems import ApiProblem
 from sprung.service.core import Core, build_core
-from sprung.service.errors import Busy
+from sprung.service.errors import NO_THREAD, Busy
+from sprung.service.monitoring import batching
 from sprung.service.monitoring.batching import AnsweredWindow, AskedWindow
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.processed import FoldedWindows, WindowsToFold
@@ -300,3 +301,26 @@ def test_more_than_may_wait_are_refused_before_they_are_read(running: Core, syst
     answers = at_once(running, [one] * 5)
     assert sum(isinstance(answer, Busy) for answer in answers) == 3
     assert len(read) == 2
+
+
+@pytest.mark.parametrize("where", ["identify", "hand over", "track"])
+def test_a_shortage_of_memory_is_told_to_who_waits_and_nobody_waits_for_ever(
+    running: Core, system: System, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """Before, no window was answered any more, and the service had to be ended by force."""
+
+    def short(*given: Any, **more: Any) -> Any:
+        raise RuntimeError(NO_THREAD) if where == "hand over" else MemoryError
+
+    with monkeypatch.context() as patch:
+        if where == "identify":
+            patch.setattr("sprung.service.monitoring.batching.np.stack", short)
+        elif where == "hand over":
+            patch.setattr(running.batcher._tracker, "submit", short)
+        else:
+            patch.setattr(batching, "_found", short)
+        answers = at_once(running, [ready(asked(running, system, vehicle, 0)) for vehicle in "ab"])
+    assert all(isinstance(answer, MemoryError | RuntimeError) for answer in answers)
+    answers = at_once(running, [ready(asked(running, system, vehicle, 0)) for vehicle in "ab"])
+    assert all(isinstance(answer, AnsweredWindow) for answer in answers)
+    assert stored(running, "a", range(2)) == {0}
