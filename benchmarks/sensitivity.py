@@ -30,7 +30,7 @@ from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.component.measured import is_component_test
 from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.investigation.diagnose import begun, concluded, under, with_findings
-from sprung.model.diagnosis.investigation.judgement.judgement import HeldOutRuns, judged
+from sprung.model.diagnosis.investigation.judgement.judgement import held_out_runs, judged
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.rules import RULES, Rules, reason
@@ -88,7 +88,7 @@ class Subject:
         if stage in LAST:
             done = self.outcome
             state = under(done.investigation, rules)
-            runs = HeldOutRuns.of(state, done.before, done.after, done.noise_faults)
+            runs = held_out_runs(state, done.runs.before, done.runs.after, done.runs.noisy)
             judgement = judged(state, runs, done.judgement.ended)
             return ReportedResult.of(compose(replace(done, investigation=state, judgement=judgement), self.record))
         if stage in LATE and name not in FIRST:

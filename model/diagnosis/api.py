@@ -111,5 +111,5 @@ def _along_what_was_seen(
     outcome = investigate(pushed, RecordedPart(record.sample_rate, values, record.lost), options, progress)
     if not inputs:
         return simulated if outcome.judgement.rejected else outcome
-    named = outcome.judgement.verdict == "missing_physics" and outcome.after.nrmse < simulated.after.nrmse
+    named = outcome.judgement.verdict == "missing_physics" and outcome.runs.after.nrmse < simulated.runs.after.nrmse
     return outcome if named else simulated

@@ -99,6 +99,16 @@ class FitSearch:
         return replace(self, left=promised, relaxation=StepRelaxation(), damping=damping, failed=True, ended=ended)
 
 
+@dataclass(frozen=True)
+class ProposedStep:
+    """What a step promised, and how far it went."""
+
+    promised: float  # decrease of the objective by its linear model
+    grain: float  # decrease of the objective that matters
+    size: float  # largest change, in standard deviations
+    short: bool  # whether no value changes by more than the tolerance
+
+
 def stepped(problem: Problem, search: FitSearch, count: int, tolerance: float) -> FitSearch:
     """The search after its `count`-th step, which is accepted, refused, or taken again from the present point."""
     rules, state = problem.rules.fit, search.state
@@ -110,6 +120,7 @@ def stepped(problem: Problem, search: FitSearch, count: int, tolerance: float) -
         search = replace(search, relaxation=search.relaxation.after(state.lin.jacobian @ step))
     step = search.relaxation.factor * step
     size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
+    taken = ProposedStep(promised, grain, size, short=size < tolerance)
     proposed = _proposed(problem, state, step, promised)
     if proposed.value >= state.value and promised < rules.numerical * grain:
         return replace(search, left=promised, ended=True)
@@ -119,34 +130,27 @@ def stepped(problem: Problem, search: FitSearch, count: int, tolerance: float) -
         if proposed.value >= search.state.value:
             return replace(search, left=promised, relaxation=StepRelaxation())
     if proposed.value < search.state.value:
-        return _accepted(problem, search.accepted(proposed), count, promised, grain, size, tolerance)
-    return _refused(problem, search, promised, grain, size, tolerance)
+        return _accepted(problem, search.accepted(proposed), taken, count)
+    return _refused(problem, search, taken)
 
 
-def _accepted(
-    problem: Problem, search: FitSearch, count: int, promised: float, grain: float, size: float, tolerance: float
-) -> FitSearch:
-    """The search after a step that lowered the objective; ended where what is left is too little to matter.
-
-    size: of the step, in standard deviations.
-    """
-    if size < tolerance:  # what it fell besides, by inputs smoothed anew, is not left
-        return replace(search, left=min(search.left, promised), ended=True)
-    if search.left < problem.rules.fit.done * grain * max(1.0, size):
+def _accepted(problem: Problem, search: FitSearch, step: ProposedStep, count: int) -> FitSearch:
+    """The search after a step that lowered the objective; ended where what is left is too little to matter."""
+    if step.short:  # what it fell besides, by inputs smoothed anew, is not left
+        return replace(search, left=min(search.left, step.promised), ended=True)
+    if search.left < problem.rules.fit.done * step.grain * max(1.0, step.size):
         return replace(search, ended=True)
     return search.with_equivalents(problem) if count in _EQUIVALENTS else search
 
 
-def _refused(
-    problem: Problem, search: FitSearch, promised: float, grain: float, size: float, tolerance: float
-) -> FitSearch:
+def _refused(problem: Problem, search: FitSearch, step: ProposedStep) -> FitSearch:
     """The search after a step that did not: with finer sensitivities or more damping, or ended."""
-    if search.renewed is not None and promised < min(search.renewed, problem.rules.fit.told * grain):
+    if search.renewed is not None and step.promised < min(search.renewed, problem.rules.fit.told * step.grain):
         return replace(search, left=0.0, ended=True)  # nothing that smoothing the inputs does not move as much
-    if promised > _MUCH * search.state.chi_square and search.state.lin.may_be_finer:
-        return search.finer(promised)
-    refused = search.refused(promised)
-    return replace(refused, ended=True) if size < tolerance else refused
+    if step.promised > _MUCH * search.state.chi_square and search.state.lin.may_be_finer:
+        return search.finer(step.promised)
+    refused = search.refused(step.promised)
+    return replace(refused, ended=True) if step.short else refused
 
 
 def _proposed(problem: Problem, state: SearchState, step: FloatArray, promised: float) -> SearchState:

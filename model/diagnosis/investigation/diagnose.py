@@ -13,8 +13,8 @@ from sprung.model.diagnosis.investigation.configuration.effects import Hypothesi
 from sprung.model.diagnosis.investigation.configuration.fitted import FittedSetup
 from sprung.model.diagnosis.investigation.configuration.search import without_setup_faults
 from sprung.model.diagnosis.investigation.judgement.judgement import (
-    HeldOutRuns,
     another_structure,
+    held_out_runs,
     judged,
     unmeasured_share,
 )
@@ -34,9 +34,7 @@ from sprung.model.diagnosis.investigation.search.named_laws import with_laws_tog
 from sprung.model.diagnosis.investigation.search.next_finding import next_finding
 from sprung.model.diagnosis.investigation.search.redundant import without_redundant
 from sprung.model.diagnosis.investigation.search.restated import restated
-from sprung.model.diagnosis.investigation.search.widened import (
-    form_covariance,
-)
+from sprung.model.diagnosis.investigation.search.widened import form_covariance
 from sprung.model.diagnosis.investigation.state import (
     InputFault,
     Investigation,
@@ -148,14 +146,14 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     if fewer is not None:
         return concluded(fewer, progress)
     before, after = state.held.runs(state.base.point, state.fit.point)
-    runs = HeldOutRuns.of(state, before, after, noise_faults(state, before, after))
+    runs = held_out_runs(state, before, after, noise_faults(state, before, after))
     if exceeds_noise(state) or np.any(runs.errors.unexplained(state.options.rules.verdict) > 0):
         wider = misfit_covariance(state.problem, state.fit)
         final = replace(final, covariance=final.covariance + wider)
         # masses and instruments that are off by less than their stated deviations are no faults either
         stated = (1 + moving) * state.fit.covariance + added + wider
         state = replace(state, fit=replace(state.fit, covariance=stated))
-    return Outcome(state, final, before, after, runs.noisy, judged(state, runs, ended))
+    return Outcome(state, final, runs, judged(state, runs, ended))
 
 
 def under(state: Investigation, rules: Rules) -> Investigation:

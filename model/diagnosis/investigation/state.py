@@ -168,6 +168,18 @@ class Investigation:
 
 
 @dataclass(frozen=True)
+class HeldOutRuns:
+    """The held-out part simulated without and with the findings, beside its noise."""
+
+    before: FreeRun
+    after: FreeRun
+    noisy: tuple[NoiseFault, ...]  # sensors with a noise that only their peers speak against
+    noise: Noise  # as far as bounded
+    floor: FloatArray  # bounded noise, in the sensors' units, (S,)
+    errors: HeldOutErrors
+
+
+@dataclass(frozen=True)
 class Judgement:
     """Judgement of an investigation."""
 
@@ -193,7 +205,5 @@ class Outcome:
 
     investigation: Investigation
     final: Fit  # on the whole recording if that succeeds, with the reported values
-    before: FreeRun  # held-out part without the findings
-    after: FreeRun  # held-out part with the findings
-    noise_faults: tuple[NoiseFault, ...]
+    runs: HeldOutRuns
     judgement: Judgement

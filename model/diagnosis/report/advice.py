@@ -40,7 +40,7 @@ def nothing_fits(outcome: Outcome) -> str:
 
 def likely_reasons(outcome: Outcome) -> list[str]:
     """Two or three likely reasons why nothing fits."""
-    state, before = outcome.investigation, outcome.before
+    state, before = outcome.investigation, outcome.runs.before
     names, rules = state.signals.sensor_names, state.options.rules.report
     turned, scales = [], []
     for i, name in enumerate(names):

@@ -27,7 +27,7 @@ from sprung.model.diagnosis.report.values import deviations, figures, formula_of
 
 def compose(outcome: Outcome, record: Recorded) -> Report:
     """The report of an investigation."""
-    state, before, after = outcome.investigation, outcome.before, outcome.after
+    state, before, after = outcome.investigation, outcome.runs.before, outcome.runs.after
     judgement, names = outcome.judgement, state.signals.sensor_names
     findings, calibration = findings_of(outcome), calibration_of(outcome)
     advice = [*state.prepared.notes, *state.notes]

@@ -36,7 +36,7 @@ def findings_of(outcome: Outcome) -> list[Finding]:
         (f.score, _input_finding(state.system, f)) for f in state.input_faults if not within_tolerance(state, f.term)
     ]
     ranked += [_out_of_order(outcome, index) for index in faulty(state)]
-    ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
+    ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.runs.noisy]
     if judgement.carried:
         ranked += [(np.inf if f.delta_bic is None else -f.delta_bic, f) for f in _physics(outcome)]
     ranked.sort(key=lambda pair: -pair[0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from sprung.model.diagnosis.investigation.judgement.imitated import imitated
 from sprung.model.diagnosis.investigation.measurements.calibration import faulty
 from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
 from sprung.model.diagnosis.investigation.measurements.floor import bounded, held_out_errors
-from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
+from sprung.model.diagnosis.investigation.state import HeldOutRuns, Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.record.signals import Noise
@@ -26,24 +26,12 @@ from sprung.model.signals import FloatArray
 _BAND = 0.8  # of the residual's power, in the band that is reported
 
 
-@dataclass(frozen=True)
-class HeldOutRuns:
-    """The held-out part simulated without and with the findings, beside its noise."""
-
-    before: FreeRun
-    after: FreeRun
-    noisy: tuple[NoiseFault, ...]  # sensors with a noise that only their peers speak against
-    noise: Noise  # as far as bounded
-    floor: FloatArray  # bounded noise, in the sensors' units, (S,)
-    errors: HeldOutErrors
-
-    @classmethod
-    def of(cls, state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...]) -> HeldOutRuns:
-        """The errors of two free runs of an investigation."""
-        noise = bounded(state, noisy)
-        floor = state.held.noise_rms(state.fit, noise)
-        errors = held_out_errors(before, after, floor, state.options.rules.verdict)
-        return cls(before, after, noisy, noise, floor, errors)
+def held_out_runs(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...]) -> HeldOutRuns:
+    """The errors of two free runs of an investigation."""
+    noise = bounded(state, noisy)
+    floor = state.held.noise_rms(state.fit, noise)
+    errors = held_out_errors(before, after, floor, state.options.rules.verdict)
+    return HeldOutRuns(before, after, noisy, noise, floor, errors)
 
 
 def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgement:
