@@ -84,7 +84,10 @@ def _begun(
 def with_force_noise(problem: Problem, start: Point) -> Problem:
     """A problem with the levels of its forces by what a start leaves."""
     lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), problem.noise)))
-    return replace(problem, noise=force_noise(lin.forward, lin.spectrum, problem.noise, problem.rules.noise))
+    noise = force_noise(lin.forward, lin.spectrum, problem.noise, problem.rules.noise)
+    band = problem.part.grid.band
+    whole = np.sqrt(np.mean(np.abs(problem.part.force[band]) ** 2, axis=0))  # more, and the force would not be measured
+    return replace(problem, noise=replace(noise, force=np.minimum(noise.force, np.maximum(whole, problem.noise.force))))
 
 
 def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, start: Point) -> FloatArray:
