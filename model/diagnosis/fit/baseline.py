@@ -86,8 +86,9 @@ def with_force_noise(problem: Problem, start: Point) -> Problem:
     lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), problem.noise)))
     noise = force_noise(lin.forward, lin.spectrum, problem.noise, problem.rules.noise)
     band = problem.part.grid.band
-    whole = np.sqrt(np.mean(np.abs(problem.part.force[band]) ** 2, axis=0))  # more, and the force would not be measured
-    return replace(problem, noise=replace(noise, force=np.minimum(noise.force, np.maximum(whole, problem.noise.force))))
+    size = np.sqrt(np.mean(np.abs(problem.part.force[band]) ** 2, axis=0))
+    most = np.where(size > 0, np.maximum(size, problem.noise.force), np.inf)  # with more, a force would not be measured
+    return replace(problem, noise=replace(noise, force=np.minimum(noise.force, most)))
 
 
 def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, start: Point) -> FloatArray:

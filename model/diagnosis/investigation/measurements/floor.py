@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.investigation.measurements.excess_noise import upper_ratio
 from sprung.model.diagnosis.investigation.state import Investigation, NoiseFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise
@@ -21,6 +22,17 @@ def leaves_more_than_noise(state: Investigation) -> bool:
     run, rules = state.held.run(state.fit.point), state.options.rules.verdict
     errors = held_out_errors(run, run, state.held.noise_rms(state.fit, bounded(state)), rules)
     return bool(np.any(errors.unexplained(rules) > 0))
+
+
+def leaves_what_sampling_leaves(state: Investigation) -> bool:
+    """Whether every sensor errs by no more than sampling makes a perfect model err, however little noise there is.
+
+    What is left then is no physics of the rig: filters before the sampling, resonances of mountings.
+    """
+    least = state.options.rules.verdict.least
+    if np.any(misfit(state.fit) > least**2):  # costs nothing
+        return False
+    return bool(np.all(state.held.run(state.fit.point).per_sensor <= least))
 
 
 def held_out_errors(before: FreeRun, after: FreeRun, floor: FloatArray, rules: VerdictRules) -> HeldOutErrors:

@@ -17,6 +17,7 @@ from sprung.model.diagnosis.investigation.measurements.calibration import (
     without_calibrations,
 )
 from sprung.model.diagnosis.investigation.measurements.data_sheets import may_be_calibration
+from sprung.model.diagnosis.investigation.measurements.floor import leaves_what_sampling_leaves
 from sprung.model.diagnosis.investigation.search.along_motion import law_along_motion
 from sprung.model.diagnosis.investigation.search.masses import imitates_errors
 from sprung.model.diagnosis.investigation.search.minor import is_minor, sought, untried
@@ -72,6 +73,8 @@ class _Competition:
 
 def next_finding(state: Investigation, number: int, progress: Progress) -> Investigation:
     """The investigation with one more finding; without one if the residual is noise or no candidate is accepted."""
+    if leaves_what_sampling_leaves(state):
+        return state
     candidates = _candidates(state)
     if candidates or share_an_element(state):
         state = with_wider_tried(state)
