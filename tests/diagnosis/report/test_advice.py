@@ -38,7 +38,7 @@ def outcome(
     )
     judgement = SimpleNamespace(rejected=rejected, parts=parts, error=0.83)
     before = SimpleNamespace(measured=SHOWN * np.array(factors), simulated=SHOWN)
-    return SimpleNamespace(investigation=investigation, judgement=judgement, before=before)
+    return SimpleNamespace(investigation=investigation, judgement=judgement, runs=SimpleNamespace(before=before))
 
 
 def test_a_sensor_that_shows_the_opposite_has_the_wrong_sign() -> None:
