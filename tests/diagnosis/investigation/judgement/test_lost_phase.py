@@ -9,7 +9,7 @@ import pytest
 
 from sprung.model.diagnosis.api import Options
 from sprung.model.diagnosis.investigation.diagnose import begun, concluded
-from sprung.model.diagnosis.investigation.judgement.judgement import HeldOutRuns, judged
+from sprung.model.diagnosis.investigation.judgement.judgement import held_out_runs, judged
 from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.system import parse_system
@@ -28,15 +28,15 @@ def case() -> tuple[Outcome, MadeRecord]:
 
 def out_of_phase(outcome: Outcome, left: float) -> Outcome:
     """The same with a free run that errs by more than the signal, and this share of unmeasured forces."""
-    state, after = outcome.investigation, replace(outcome.after, per_sensor=np.array([1.3]))
-    runs = HeldOutRuns.of(state, outcome.before, after, outcome.noise_faults)
+    state, after = outcome.investigation, replace(outcome.runs.after, per_sensor=np.array([1.3]))
+    runs = held_out_runs(state, outcome.runs.before, after, outcome.runs.noisy)
     runs = replace(runs, errors=replace(runs.errors, after=after.per_sensor))
     structure = state.fit.forward.plant.structure
     inertia = structure.mass * state.fit.forward.part.grid.inverse(state.fit.motions.acceleration)
     force = np.full(len(state.fit.noise.force), left * float(np.sqrt(np.mean(inertia**2))))
     fit = replace(state.fit, noise=replace(state.fit.noise, force=force))
     state = replace(state, fit=fit)
-    return replace(outcome, investigation=state, after=after, judgement=judged(state, runs))
+    return replace(outcome, investigation=state, runs=runs, judgement=judged(state, runs))
 
 
 def test_what_is_left_is_said_of_the_unmeasured_forces_and_not_of_the_free_run(
