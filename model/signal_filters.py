@@ -22,6 +22,11 @@ def _signal() -> Any:
     return signal
 
 
+def preload() -> None:
+    """Import now what the first filter would have to wait for."""
+    _signal()
+
+
 def lfilter(numerator: Coefficients, denominator: Coefficients, series: FloatArray) -> FloatArray:
     """A series (T,) through a digital filter at rest."""
     found: FloatArray = _signal().lfilter(numerator, denominator, series)

@@ -14,6 +14,7 @@ from functools import partial
 from prometheus_client import Histogram
 
 from sprung import __version__
+from sprung.model.signal_filters import preload
 from sprung.model.signals import Tally
 from sprung.service.access.oidc import Provider, provider_of
 from sprung.service.access.tokens import Tokens
@@ -101,6 +102,7 @@ class Core:
         self.housekeeping.start()
         self.notices.start()
         self.ingest.start()
+        preload()  # the first minute that ends would wait for it, and all windows behind it
         # what lives as long as the service is not looked through again: 320 000 objects, a pause for every client
         gc.collect()
         gc.freeze()

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse, Response
 from sqlalchemy import Connection
 
@@ -77,7 +78,7 @@ async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
             hints=hints(row, view, values["active"], values["reasons"], silent, sensors),
             side=side_view(system, parameters, sensors),
             plan=plan_view(system, parameters),
-            ride=core.rides.latest(id),
+            ride=await run_in_threadpool(core.rides.latest, id),
             sensors=sensors,
             data=page_data(system, view, values["alarms"], values["marks"]),
         )

@@ -11,7 +11,10 @@ from fastapi.testclient import TestClient
 from sprung.model.comfort import W_K
 from sprung.model.signals import Window
 from sprung.model.system import System
+from sprung.model.tracking.tracker import TrackerState
 from sprung.service.core import Core
+from sprung.service.monitoring import rides
+from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.places import Places
 from tests.service_fakes import make_window
 
@@ -68,3 +71,24 @@ def test_vehicles_that_report_in_turns_keep_their_minutes(core: Core, system: Sy
             core.pipeline.process(vehicle, [shaken(system, n, 0.5) for n in range(number, number + 20)])
     assert core.rides.latest("first") is not None
     assert core.rides.latest("second") is None
+
+
+def test_windows_do_not_wait_for_the_comfort_of_the_minute_that_they_end(
+    core: Core, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Minutes of many vehicles end at once: foreseen one after the other they held up all windows for most of a
+    second."""
+    asked: list[TrackerState] = []
+    real = rides.cost
+
+    def counted(engine: Engine, state: TrackerState) -> float | None:
+        asked.append(state)
+        return real(engine, state)
+
+    monkeypatch.setattr(rides, "cost", counted)
+    core.pipeline.process("a", [shaken(system, number, 0.5) for number in range(140)])
+    assert asked == []
+    minute = core.rides.latest("a")
+    assert minute is not None and minute.cost is not None
+    assert len(asked) == 1
+    assert core.rides.all() == {"a": minute} and len(asked) == 1  # remembered
