@@ -19,6 +19,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import BaseRoute, Match, Route
 
+from sprung.model.text import first_line
 from sprung.service.errors import NO_THREAD, Busy, NoSpace, NotFound, TooManyOfOne, UserError
 from sprung.service.observability.logs import LOGGED
 from sprung.service.rendering.render import render
@@ -162,7 +163,7 @@ def _as_problem(error: Exception) -> ApiProblem:
         case NoSpace():
             return ApiProblem(507, str(error), headers=ROOM)
         case SQLAlchemyError() | OSError() | MemoryError() | RuntimeError() if found := _resource_problem(error):
-            log.error("%s: %s", found.detail, error)
+            log.error("%s: %s", found.detail, first_line(error))
             return found
         case _:
             log.error("unexpected error", exc_info=error)

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
+from sprung.model.text import first_line
 from sprung.service.errors import Busy, NotFound, UserError
 from sprung.service.observability.queues import WaitMetrics
 from sprung.service.retrying import message_of, retry
@@ -296,7 +297,7 @@ class Jobs:
                         work.update_job(connection, job_id, now_ns(), **values)
                 return
             except (SQLAlchemyError, OSError) as error:
-                log.error("the end of job %s cannot be stored yet: %s", job_id, error)
+                log.error("the end of job %s cannot be stored yet: %s", job_id, first_line(error))
                 if self._stopping.wait(RETRY_SECONDS):
                     return  # it is done again at the next start
 
@@ -305,4 +306,4 @@ class Jobs:
             with self._store.write() as connection:
                 work.update_job(connection, job_id, now_ns(), progress=share)
         except (SQLAlchemyError, OSError) as error:
-            log.warning("the progress of job %s cannot be stored: %s", job_id, error)
+            log.warning("the progress of job %s cannot be stored: %s", job_id, first_line(error))

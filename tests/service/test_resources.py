@@ -59,7 +59,12 @@ def test_a_disk_that_fills_is_not_ready(client: TestClient, monkeypatch: pytest.
     ],
 )
 def test_what_is_lacking_is_reported_as_what_it_is(
-    client: TestClient, core: Core, monkeypatch: pytest.MonkeyPatch, error: Exception, status: int
+    client: TestClient,
+    core: Core,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    error: Exception,
+    status: int,
 ) -> None:
     reading = core.store.read
 
@@ -73,4 +78,6 @@ def test_what_is_lacking_is_reported_as_what_it_is(
     assert answer.status_code == status
     assert answer.headers["content-type"] == "application/problem+json"
     assert "retry-after" in answer.headers or status == 500
+    said = [record.getMessage() for record in caplog.records if record.name == "sprung.api"]
+    assert said and not any("sqlalche.me" in line or line.endswith(": ") for line in said)
     assert client.get("/health/live").status_code == 200
