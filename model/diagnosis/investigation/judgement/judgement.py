@@ -45,8 +45,8 @@ def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgemen
     lost = state.problem.process_noise and runs.after.nrmse > rules.rejected
     deciding = _deciding_errors(state, errors, runs.noise, lost=lost)
     faults, physics = _kinds_of_faults(state, runs.noisy), _kinds_of_physics(state)
-    other = another_structure(state, deciding)
-    place = "" if other else imitated(state, deciding)
+    place = imitated(state, deciding)
+    other = not place and another_structure(state, deciding)
     verdict = verdict_of(
         faults + physics, deciding, rules, other_structure=other, imitated=bool(place), ended=bool(ended)
     )
@@ -61,7 +61,7 @@ def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgemen
         rejected=rejected,
         lost_phase=lost,
         nothing_fits=rejected or (unknown and lost and error**2 > rules.gross),
-        parts=changed_parts(state) + _out_of_order(state) if other else 0,
+        parts=changed_parts(state) + _modes(state) + _out_of_order(state) if other else 0,
         carried=_carries(verdict, physics) and not place,
         imitated=place,
         ended=ended,
@@ -112,6 +112,12 @@ def changed_parts(state: Investigation) -> int:
     return moved + sum(found.trial.term.law.part for found in state.found)
 
 
+def _modes(state: Investigation) -> int:
+    """Number of elastic modes of bodies among the findings, of which a body may have several."""
+    laws = [found.trial.term.law for found in state.found]
+    return sum(law.adds_motion and not law.part for law in laws)
+
+
 def _out_of_order(state: Investigation) -> int:
     """Number of masses and instruments that are off beyond their tolerances."""
     if state.calibrations:
@@ -123,10 +129,10 @@ def _out_of_order(state: Investigation) -> int:
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
     """Whether so many changes were found that they imitate another structure than the file's.
 
-    More structural ones than a few in any case, more than one if they leave a significant error (`errors`): together
-    linear parts approximate any linear structure, and true ones would leave noise.  Masses and instruments off beyond
-    their tolerances count, too, where they are most of all, are beside more than one structural change, or leave much:
-    they then take up what a law beside them lacks, which counts with them.
+    More structural ones than a few in any case, more than one, elastic modes among them, if they leave a significant
+    error (`errors`): together linear parts approximate any linear structure, and true ones would leave noise.  Masses
+    and instruments off beyond their tolerances count, too, where they are most of all, are beside more than one
+    structural change, or leave much: they then take up what a law beside them lacks, which counts with them.
     """
     rules, parts = state.options.rules.verdict, changed_parts(state)
     if errors is None or parts > rules.parts:
@@ -134,7 +140,9 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
     off = _out_of_order(state)
     share = errors.explained(rules)
     left = bool(np.any(errors.unexplained(rules) > 0))
-    if (state.calibrations and 2 * off > state.calibrations) or (parts > 1 and (left or off > 0)):
+    if (state.calibrations and 2 * off > state.calibrations) or (parts > 1 and off > 0):
+        return True
+    if left and parts + _modes(state) > 1:
         return True
     much = left and share is not None and share < 1 - rules.parts_leave
     beside = sum(found.trial.term.law.in_time for found in state.found) if off else 0

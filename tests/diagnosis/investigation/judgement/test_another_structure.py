@@ -34,6 +34,10 @@ def investigation(laws: list[str], moved: bool) -> Any:
         (["missing_connection", "suspended_mass"], False, 0.02, False),
         (["missing_connection", "suspended_mass"], False, 0.20, True),  # two that leave 6 % of the power
         (["missing_connection", "suspended_mass"], False, 0.06, True),  # two that leave more than noise
+        (["flexible_mode", "suspended_mass"], False, 0.06, True),  # what modes damped one by one are imitated by
+        (["flexible_mode", "suspended_mass"], False, 0.02, False),
+        (["flexible_mode", "coulomb_friction"], False, 0.06, False),
+        (["flexible_mode"] * 3, False, 0.02, False),  # of one car body
         (["missing_connection", "coulomb_friction"], False, 0.20, False),
         (["missing_connection", "sensor_gain", "series_stiffness"], False, 0.02, True),  # what bending is imitated by
         (["missing_connection", "sensor_gain"], False, 0.02, False),
