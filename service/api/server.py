@@ -30,6 +30,7 @@ UNREAD_SECONDS = 60.0  # an answer may wait for the client to take what asyncio 
 STALLED_SECONDS = 2.0  # from then on a client that does not take its answer is one that only waits
 LINGER_SECONDS = 1.0  # that a refused client has to read why: closed at once, it would hear of a reset instead
 REST_SECONDS = 30.0  # for the rest of a body that nobody wants any more; many clients read only when they have sent all
+READ_BYTES = 1 << 16  # that are read at once: so little is found in a heap that may not grow any more
 KERNEL_BYTES = 1 << 17  # of an answer that the kernel may hold for a client that takes nothing; else it is megabytes
 
 REFUSED = (
@@ -81,6 +82,7 @@ class GuardedProtocol(H11Protocol):
         self._full: float | None = None  # since when the client has not read its answer
         self._unsent, self._moved = 0, self.active  # bytes that waited when it was last looked at, and since when
         _hold_little(transport)
+        transport.max_size = READ_BYTES  # type: ignore[attr-defined]  # of asyncio's own, which takes 256 kB
         self._admitted = self.doorkeeper.admit(self)
         if not self._admitted:
             self._refuse()
@@ -95,6 +97,7 @@ class GuardedProtocol(H11Protocol):
             self._lingers = None
             self.doorkeeper.lingering -= 1
         super().connection_lost(exc)
+        self.transport.close = self.transport.transport.close  # no circle: what was held of a body goes at once
 
     def data_received(self, data: bytes) -> None:
         """A client sends."""

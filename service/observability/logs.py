@@ -76,6 +76,12 @@ def foreseen(record: logging.LogRecord) -> bool:
     error = record.exc_info[1] if record.exc_info else None
     if isinstance(error, OSError) and error.errno in SHORTAGES and record.name == "asyncio":
         record.msg, record.args, record.exc_info = f"no connection is accepted: {error.strerror}", None, None
+    elif isinstance(error, MemoryError) and record.name == "asyncio":
+        record.msg, record.args, record.exc_info = (
+            "a connection is dropped: there is no memory for what it sends",
+            None,
+            None,
+        )
     return not isinstance(error, CancelledError)
 
 

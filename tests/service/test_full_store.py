@@ -97,6 +97,8 @@ def test_shortages_and_requests_given_up_at_the_end_are_no_tracebacks_in_the_log
     record = logging.LogRecord("asyncio", logging.ERROR, "", 0, "socket.accept() ...", None, (OSError, error, None))
     assert foreseen(record) and record.exc_info is None
     assert record.getMessage() == "no connection is accepted: Too many open files"
+    record = logging.LogRecord("asyncio", logging.ERROR, "", 0, "Fatal read", None, (MemoryError, MemoryError(), None))
+    assert foreseen(record) and record.exc_info is None and "no memory" in record.getMessage()
     given_up = (CancelledError, CancelledError(), None)
     assert not foreseen(logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Exception", None, given_up))
     wrong = (ValueError, ValueError("x"), None)

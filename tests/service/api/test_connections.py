@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import gc
 import socket
 import time
+import weakref
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 from http.client import HTTPConnection
@@ -17,6 +20,7 @@ from sprung.service.core import build_core
 from sprung.service.monitoring.engine import Engine
 from tests.served import served
 from tests.service.api.test_server import ask, settings
+from tests.service_fakes import eventually
 
 HALF = b"GET /vehicles HTTP/1.1\r\nHost: loc"
 UPLOAD = b"POST /recordings HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
@@ -143,3 +147,30 @@ def test_a_body_without_end_is_not_taken_for_ever(
                     endless.sendall(b"10000\r\n" + b" " * 65536 + b"\r\n")
                     time.sleep(0.01)
             assert 1.5 < time.monotonic() - begun < 10, path
+
+
+def test_what_a_connection_held_of_a_body_goes_with_it(
+    engine: Engine, data_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not when Python looks for circles: where memory is short no connection would find room for what it sends."""
+    seen: list[weakref.ref[server.GuardedProtocol]] = []
+    begin = server.GuardedProtocol.connection_made
+
+    def noted(self: server.GuardedProtocol, transport: asyncio.Transport) -> None:
+        seen.append(weakref.ref(self))
+        begin(self, transport)
+
+    monkeypatch.setattr(server.GuardedProtocol, "connection_made", noted)
+    with served(build_core(settings(data_dir), engine)) as port:
+        gc.collect()
+        gc.disable()
+        try:
+            for _ in range(3):
+                with closing(HTTPConnection("127.0.0.1", port, timeout=20)) as connection:
+                    connection.request(
+                        "POST", "/identify", b"[" + b" " * 1_500_000, {"content-type": "application/json"}
+                    )
+                    assert connection.getresponse().status == 422
+            eventually(lambda: len(seen) >= 3 and not any(one() for one in seen))
+        finally:
+            gc.enable()
