@@ -36,6 +36,7 @@ from sprung.model.diagnosis.investigation.search.redundant import without_redund
 from sprung.model.diagnosis.investigation.search.restated import restated
 from sprung.model.diagnosis.investigation.search.widened import form_covariance
 from sprung.model.diagnosis.investigation.state import (
+    HeldOutRuns,
     InputFault,
     Investigation,
     Nominal,
@@ -145,8 +146,7 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
     fewer = without_refuted(state, final)
     if fewer is not None:
         return concluded(fewer, progress)
-    before, after = state.held.runs(state.base.point, state.fit.point)
-    runs = held_out_runs(state, before, after, noise_faults(state, before, after))
+    runs = _held_out(state, final)
     if exceeds_noise(state) or np.any(runs.errors.unexplained(state.options.rules.verdict) > 0):
         wider = misfit_covariance(state.problem, state.fit)
         final = replace(final, covariance=final.covariance + wider)
@@ -154,6 +154,28 @@ def concluded(state: Investigation, progress: Progress) -> Outcome:
         stated = (1 + moving) * state.fit.covariance + added + wider
         state = replace(state, fit=replace(state.fit, covariance=stated))
     return Outcome(state, final, runs, judged(state, runs, ended))
+
+
+def _held_out(state: Investigation, final: Fit) -> HeldOutRuns:
+    """The held-out part without and with the findings, at the values of the fitted part.
+
+    At those of the whole recording where they are as likely by the fitted part, and leave no more than noise: it did
+    not determine them, as a sweep's does that has not reached a resonance yet.
+    """
+    before, after = state.held.runs(state.base.point, state.fit.point)
+    noisy, rules = noise_faults(state, before, after), state.options.rules.verdict
+    runs = held_out_runs(state, before, after, noisy)
+    if not np.any(runs.errors.unexplained(rules) > 0) or not _as_likely(state.fit, final, rules.spread):
+        return runs
+    other = held_out_runs(state, before, state.held.run(final.point), noisy)
+    return runs if np.any(other.errors.unexplained(rules) > 0) else other
+
+
+def _as_likely(fit: Fit, other: Fit, spread: float) -> bool:
+    """Whether all values of another fit are within so many standard deviations of those of a fit."""
+    moved = [np.subtract(b.parameters, a.parameters) for a, b in zip(fit.point.terms, other.point.terms, strict=True)]
+    away = np.concatenate([other.point.theta - fit.point.theta, *moved])
+    return bool(np.all(np.abs(away) <= spread * np.sqrt(np.diag(fit.covariance)[: len(away)])))
 
 
 def under(state: Investigation, rules: Rules) -> Investigation:

@@ -58,9 +58,12 @@ def within_data_sheet(state: Investigation, term: Term) -> bool:
 
 
 def may_be_calibration(state: Investigation, term: Term) -> bool:
-    """Whether a fault may be within a data sheet: a sensor is compared with an input, whose error it contains."""
-    within = 2 * state.options.rules.plausible.calibration
-    return term.law.of_instrument is not None and _in_deviations(state, term) <= within
+    """Whether a fault may be within a data sheet: a sensor is compared with an input, whose error it contains.
+
+    So may a mass that a measured force weighs; without one it is compared with others, and stands for their errors.
+    """
+    compared = term.law.of_instrument is not None or (term.law.scales and _measures_force(state.system))
+    return bool(compared) and _in_deviations(state, term) <= 2 * state.options.rules.plausible.calibration
 
 
 def _in_deviations(state: Investigation, term: Term) -> float:

@@ -73,7 +73,7 @@ class _Competition:
 
 def next_finding(state: Investigation, number: int, progress: Progress) -> Investigation:
     """The investigation with one more finding; without one if the residual is noise or no candidate is accepted."""
-    if leaves_what_sampling_leaves(state):
+    if state.calibrations is not None and leaves_what_sampling_leaves(state):
         return state
     candidates = _candidates(state)
     if candidates or share_an_element(state):
