@@ -109,18 +109,21 @@ def _with_leading(state: Investigation, competition: _Competition, progress: Cal
     """The investigation with the leading candidate as a finding; without it if it may be chance, or is refuted.
 
     A candidate within the data sheet of its instrument is not a finding, nor is one that other masses and instruments
-    together explain better: masses and instruments are calibrated then.
+    together explain better: masses and instruments are calibrated then, even if the held-out part refutes the one that
+    stands for all of them.
     """
     trials, note = with_formula(state, competition.findings, competition.leading)
     chosen = trials[0]
-    if not _is_acceptable(state, chosen):
+    p_value = _p_value(state, chosen)
+    if p_value > state.options.rules.acceptance.alpha:
         return state
     if state.calibrations is None and (may_be_calibration(state, chosen.term) or imitates_errors(state, chosen)):
         state = calibrated(state, chosen.term)
         if state.calibrations:
             return state
+    if state.refutes(chosen.fit):
+        return state
     second = runner_up(state.problem, state.fit, untried(state, state.last.candidates), chosen, competition.plausible)
-    p_value = _p_value(state, chosen)
     state, trial = _refitted(state, chosen, trials)
     rivals = tuple(t for t in trials if t is not trial)
     found = AcceptedFinding(trial, rivals, second, p_value, tuple(t for t, _ in competition.implausible))
