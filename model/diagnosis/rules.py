@@ -498,6 +498,9 @@ class ComponentRules:
     imitated: float = rule(
         0.005, "of the excess power, that laws may leave as a force of the motion; chosen: 7 % of a force", 0.002, 0.02
     )
+    as_good: float = rule(
+        1.1, "times the held-out power left by a law, that a look-alike may leave; chosen: of 1.07 and 1.22", 1.07, 1.2
+    )
     another_force: float = rule(
         0.5, "of what laws leave, left beside an unnamed force that they lack; chosen: most of it", 0.3, 0.7
     )

@@ -10,7 +10,7 @@ import numpy as np
 from sprung.model.diagnosis.component.compose import compose_components
 from sprung.model.diagnosis.component.drifting import drifts, possible_drift
 from sprung.model.diagnosis.component.formula import formula_search
-from sprung.model.diagnosis.component.imitated import imitates
+from sprung.model.diagnosis.component.imitated import approximate, imitates
 from sprung.model.diagnosis.component.judgement import JudgedComponent, concluded
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
 from sprung.model.diagnosis.component.smooth import smooth_serves
@@ -131,7 +131,7 @@ def _doubtful(judged: JudgedComponent, rules: VerdictRules) -> bool:
         return True
     if steps and (judged.errors.outweigh_findings(rules) or judged.errors.reject(rules)):
         return True
-    if steps and imitates(judged.final, judged.base):
+    if steps and (imitates(judged.final, judged.base) or approximate(judged.final, judged.base, judged.alike)):
         return True
     return bool(_undetermined(judged)) or smooth_serves(judged.final, len(judged.record.given.pieces))
 

@@ -7,8 +7,12 @@ loop that force follows the loop whatever its origin, so that nothing is told.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from sprung.model.diagnosis.component.alike import EquivalentModel
 from sprung.model.diagnosis.force.fit import ComponentFit, fitted
 from sprung.model.diagnosis.force.slider_surface import SURFACE
+from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
 
 
@@ -34,3 +38,22 @@ def imitates(fit: ComponentFit, base: ComponentFit) -> bool:
             (base.held_out, fit.held_out, beside.held_out),
         )
     )
+
+
+def approximate(fit: ComponentFit, base: ComponentFit, alike: Iterable[EquivalentModel]) -> bool:
+    """Whether the laws of a fit are no more than approximations: others leave as much, and that is no noise.
+
+    A true law leaves less than one that resembles it, and predicts the held-out part better.  base: the model without
+    them; alike: the look-alikes.  Along a motion that repeats one loop the record may be too poor to tell them apart,
+    whatever else the rig adds.
+    """
+    if not fit.leaves_more or fit.task.motion.repeats(fit.task.rules):
+        return False
+    noise, most = fit.floor**2, fit.task.rules.together
+    if max(fit.error - noise - most * (base.error - noise), fit.held_out - noise - most * (base.held_out - noise)) <= 0:
+        return False
+    laws = {piece.effect for piece in fit.model.pieces}
+    most_held_out = noise + fit.task.rules.as_good * (fit.held_out - noise)
+    others = (one for one in alike if one.effect not in laws and one.fit.leaves_more)
+    others = (one for one in others if one.fit.held_out <= most_held_out)
+    return any(one.fit.model.pieces[one.index].effect_kind is EffectKind.LISTED for one in others)

@@ -28,6 +28,7 @@ def judged(before: float, after: float) -> Any:
             leaves_more=True,
         ),
         base=None,
+        alike=(),
         record=SimpleNamespace(given=SimpleNamespace(pieces=())),
     )
 

@@ -24,6 +24,18 @@ def filled_rubber() -> Force:
     return sliders(np.maximum(-np.diff(np.append(slope, slope[-1])), 0.0), reach)
 
 
+def rubber_spring(d: FloatArray, v: FloatArray) -> FloatArray:
+    """Friction of rubber (Berg): hyperbolic branches from every turning point to 300 N either way."""
+    most, half = 300.0, 2e-3
+    path, begun, since, turned = np.zeros(len(d)), 0.0, float(d[0]), 0.0
+    for i, way in enumerate(np.sign(np.diff(d)).tolist(), 1):
+        if way not in (0.0, turned):
+            begun, since, turned = path[i - 1], d[i - 1], way
+        gone = abs(d[i] - since)
+        path[i] = begun + turned * gone / (half * (1 - turned * begun / most) + gone) * (most - turned * begun)
+    return path
+
+
 def kwok(d: FloatArray, v: FloatArray) -> FloatArray:
     """A magneto-rheological damper after Kwok et al. (2006)."""
     return np.asarray(250.0 * np.tanh(25.0 * v + 0.6 * np.sign(d)))
@@ -35,10 +47,11 @@ def kwok(d: FloatArray, v: FloatArray) -> FloatArray:
         (even_sliders(), "random"),
         (even_sliders(), "sines"),
         (filled_rubber(), "random"),
+        (rubber_spring, "random"),
         pytest.param(leaves(3e4, 160.0, 2e-3, 0.3), "random", marks=pytest.mark.slow),
         pytest.param(kwok, "sines", marks=pytest.mark.slow),
     ],
-    ids=["iwan-random", "iwan-sines", "rubber-random", "leaves-random", "kwok-sines"],
+    ids=["iwan-random", "iwan-sines", "rubber-random", "berg-random", "leaves-random", "kwok-sines"],
 )
 def test_a_force_that_a_law_resembles_is_unknown_where_the_law_leaves_a_force_of_the_motion(
     force: Force, kind: str
