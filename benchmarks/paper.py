@@ -1,9 +1,9 @@
 """`sprung bench paper [TASK]`: every table row and figure of the paper, from nothing, beside the paper's values.
 
-Tasks: the three visual systems, one of them with a wrong opening, their baselines tuned, the train with constant,
-changing and drifting parameters, the kernels of Fig. 3, the experiments on phases and on features, and what a window
-tells.  Checkpoints lie under `--out` (`runs/paper`, not kept in the repository): a command that was stopped, or that
-ran out of `--minutes`, goes on where it was when it is given again.
+Tasks: the three visual systems, one of them with a wrong opening, methods with settings searched for each, the train
+with constant, changing and drifting parameters, the kernels of Fig. 3, the experiments on phases and on features, and
+what a window tells.  Checkpoints lie under `--out` (`runs/paper`, not kept in the repository): a command that was
+stopped, or that ran out of `--minutes`, goes on where it was when it is given again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sprung.benchmarks import (
     paper_visual,
     phase_information,
     poor_opening,
-    tuned_baselines,
+    tuning,
     window_information,
 )
 from sprung.benchmarks.paper_settings import PaperSettings
@@ -41,7 +41,7 @@ TASKS: dict[str, tuple[Callable[[PaperSettings], Iterator[dict[str, Any]]], tupl
     "mass_spring_damper": (paper_visual.rows, paper_visual.METHODS),
     "two_body": (paper_visual.rows, paper_visual.METHODS),
     "poor_opening": (poor_opening.rows, poor_opening.METHODS),
-    "tuning": (tuned_baselines.rows, tuned_baselines.METHODS),
+    "tuning": (tuning.rows, tuning.METHODS),
     "train": (paper_train.constant_rows, paper_train.CONSTANT_METHODS),
     "train_changing": (paper_train.changing_rows, paper_train.CHANGING_METHODS),
     "train_drifting": (drifting.rows, drifting.METHODS),

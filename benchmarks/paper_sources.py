@@ -27,7 +27,7 @@ MADE_BY: dict[str, tuple[str, str]] = {  # task: module and function of its rows
     "systems": (f"{_BENCH}.paper_visual", "system_rows"),
     **{task: (f"{_BENCH}.paper_visual", "rows") for task in _VISUAL},
     "poor_opening": (f"{_BENCH}.poor_opening", "rows"),
-    "tuning": (f"{_BENCH}.tuned_baselines", "rows"),
+    "tuning": (f"{_BENCH}.tuning", "rows"),
     "train": (f"{_BENCH}.paper_train", "constant_rows"),
     "train_changing": (f"{_BENCH}.paper_train", "changing_rows"),
     "train_drifting": (f"{_BENCH}.drifting", "rows"),

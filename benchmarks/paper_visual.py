@@ -153,12 +153,13 @@ def _untrained(method: str, data: _Data) -> tuple[dict[str, float | None], dict[
     affine = metrics.affine_gauge(task, fitted.simulated, fitted.true)
     found = replace(moved, simulated=affine(answered.simulated))
     figures |= _gauge_free(task, found)
-    if method == "output_error":
+    if method == "output_error" and reading is not None:
         for name in ("unseen", "below", "noisy"):
             other = data.splits[name]
             few = torch.arange(len(other.embeddings))
             beyond = evaluate.state_figures(task, _answered(task, method, reading, other, few, few % 26))
             figures[f"PE_{name}"], figures[f"PE_{name}_relative"] = beyond["PE"], beyond["PE_relative"]
+        figures["forecast_relative"] = _forecast_error(task, reading, test, affine)
     return figures, evaluate.by_trajectory(task, found, rows)
 
 
@@ -177,6 +178,14 @@ def _answered(
             fitted = output_error.fit_windows(task, read, windows(split.rollouts.inputs, starts, rows))
             simulated, parameters = fitted.simulated, fitted.parameters
     return Predicted(true, states, simulated, None, parameters, split.rollouts.parameters[rows])
+
+
+def _forecast_error(task: Task, reading: output_error.PositionReading, split: Split, move: evaluate.Move) -> float:
+    """As `evaluate.forecast_error`: the first window of each trajectory is fitted, what follows is simulated."""
+    inputs = split.rollouts.inputs
+    fitted = output_error.fit_windows(task, reading(split.embeddings[:, :WINDOW]), inputs[:, :WINDOW])
+    beyond = move(fitted.forecast(task, inputs))[:, WINDOW:]
+    return metrics.relative_state_error(task, beyond, split.rollouts.states[:, WINDOW:])
 
 
 def _gauge_free(task: Task, found: Predicted) -> dict[str, float | None]:

@@ -58,6 +58,10 @@ class FittedWindows:
     simulated: Tensor  # (B, T, N)
     misfit: Tensor  # (B,): rms of the positions' error, in units of their size
 
+    def forecast(self, task: Task, inputs: Tensor) -> Tensor:
+        """States (B, T', N) from the start of each window on, as long as its inputs (B, T', I) are known."""
+        return task.simulate(self.simulated[:, 0], self.parameters, inputs)
+
 
 def _columns(task: Task, states: Tensor) -> Tensor:
     """Positions (..., N) as a reading gives them before it makes angles of them (..., C)."""

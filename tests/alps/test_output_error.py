@@ -38,6 +38,9 @@ def test_true_positions_give_the_true_parameters_and_states(task: Task) -> None:
     assert float(metrics.state_errors(task, found.simulated, true).median()) < 1e-3 * float(
         true.square().sum((1, 2)).median()
     )
+    beyond = found.forecast(task, data.rollouts.inputs)[:, WINDOW:]  # what the window leads to
+    after = data.rollouts.states[:, WINDOW:]
+    assert float(metrics.state_errors(task, beyond, after).median()) < 0.01 * float(after.square().sum((1, 2)).median())
 
 
 def test_a_pendulum_is_identified_from_an_affine_image_of_its_circle() -> None:
