@@ -72,7 +72,7 @@ def _over(rows: Rows, task: str, method: str) -> tuple[str, ...]:
     if over is None or over_tuned is None:
         return ratio, "-", "-", "-", "-"
     each = ", ".join(f"{one:.3g}" for one in over_tuned.by_seed)
-    lost = [str(row["seed"]) for row in rows if (row["task"], row["method"]) == (task, name) and "diverged" in row]
+    lost = [str(row["seed"]) for row in rows if (row["task"], row.get("method")) == (task, name) and "diverged" in row]
     each += f"; diverged on seed {', '.join(lost)}" if lost else ""
     p = "-" if over_tuned.p_seeds is None else f"{over_tuned.p_seeds:.2g}"
     return ratio, f"{over.ratio:.3g}", f"{over_tuned.ratio:.3g}", each, p
