@@ -64,7 +64,9 @@ class Identifies(Protocol):
     def times(self) -> StageTimes:
         """Seconds spent in the stages of the last batch."""
 
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+    def identify(
+        self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False, loads: bool = False
+    ) -> list[Estimate]:
         """One `Estimate` per window of (B, T, C), columns in the order of `System.channels`, NaN for absent sensors.
 
         start: log-ratios (B, P) to begin from.  Errors: `UnusableWindow`.

@@ -34,7 +34,9 @@ class FakeIdentifier:
     std: float = 0.01
     chi_square: float = 1.0
 
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+    def identify(
+        self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False, loads: bool = False
+    ) -> list[Estimate]:
         assert windows.ndim == 3 and windows.shape[2] == len(self.system.channels), windows.shape
         inputs = len(self.system.inputs)
         assert all(np.isfinite(window[:, :inputs]).any() for window in windows), "every input is missing"

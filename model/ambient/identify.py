@@ -51,10 +51,12 @@ class _WindowByWindow(ABC):
         """Names the model that made an estimate."""
         return self.system.digest
 
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+    def identify(
+        self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False, loads: bool = False
+    ) -> list[Estimate]:
         """One `Estimate` per window (B, T, C), NaN columns for absent sensors; see `model.identifier.Identifies`.
 
-        states: ignored, since the excitation is unknown.  Errors: `UnusableWindow`.
+        states, loads: ignored, since the excitation is unknown.  Errors: `UnusableWindow`.
         """
         windows = checked_windows(self.system, windows)
         begin = time.perf_counter()

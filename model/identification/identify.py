@@ -73,13 +73,16 @@ class Identifier:
         start: FloatArray | None = None,
         *,
         states: bool = False,
+        loads: bool = False,
         weigh: BoolArray | None = None,
     ) -> list[Estimate]:
         """One `Estimate` per window.
 
         windows: (B, T, C) in the order of `system.channels`, NaN columns for channels that are absent.
         start: log-ratios (B, P) to refine from, such as the tracker's; the estimator's where left out.
-        states: estimates hold the simulated outputs; what the vehicle carries is refined along, as sensors show it.
+        states: estimates hold the simulated outputs.
+        loads: what the vehicle carries is refined along even where the file does not declare it, so that outputs are
+        those of the loaded vehicle.
         weigh: windows (B,) whose evidence on gains, delays and loads is wanted, see `Estimate.deviating`.
         A window that lacks all sensors, or inputs without which nothing can be said (`System.needed`), is not
         identified, with the reason.  Errors: `UnusableWindow` for a wrong shape or infinite values.
@@ -88,12 +91,14 @@ class Identifier:
         usable = self._usable(windows)
         if not usable.all():
             given, wanted = None if start is None else start[usable], None if weigh is None else weigh[usable]
-            return self._unusable_among(windows, self.identify(windows[usable], given, states=states, weigh=wanted))
+            return self._unusable_among(
+                windows, self.identify(windows[usable], given, states=states, loads=loads, weigh=wanted)
+            )
         if len(windows) == 0:
             return []
         windows = self.system.undistorted(windows)
         self._allow(windows)
-        loads = bool(self.system.loads) if states else any(load.declared for load in self.system.loads)
+        loads = bool(self.system.loads) and (loads or any(load.declared for load in self.system.loads))
         begin = time.perf_counter()
         start = self._start(windows, start, loads=loads)
         between = time.perf_counter()

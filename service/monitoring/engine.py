@@ -84,16 +84,18 @@ class Engine:
         self,
         values: FloatArray,
         states: bool = False,
+        loads: bool = False,
         starts: Sequence[int] | None = None,
         known: Sequence[tuple[MeasurementFault, ...]] = (),
     ) -> tuple[list[Estimate], dict[str, float]]:
         """Estimates of windows, values of shape (B, T, C), and the seconds they took by stage.
 
+        loads: what the vehicle carries is refined along even where its file does not declare it.
         starts: ns, of windows that will be tracked: measurements that are wrong are looked for, too.
         known: of each such window, `Tracker.known_faults` of its vehicle, which spares looking for these anew.
         """
         if starts is None:
-            estimates = self.identifier.identify(values, states=states)
+            estimates = self.identifier.identify(values, states=states, loads=loads)
         else:
             weigh = np.array([self._weighed(start) for start in starts])
             estimates = self.identifier.examine(values, weigh, known)

@@ -31,9 +31,11 @@ class IdentifierApart:
         self._here = here
         self._ask_there = ask
 
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+    def identify(
+        self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False, loads: bool = False
+    ) -> list[Estimate]:
         """As that of the identifier."""
-        return self._ask("identify", windows, start, states=states)
+        return self._ask("identify", windows, start, states=states, loads=loads)
 
     def examine(
         self, windows: FloatArray, weigh: BoolArray, known: Sequence[tuple[MeasurementFault, ...]] = ()

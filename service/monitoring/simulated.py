@@ -67,7 +67,7 @@ def compare_all(engine: Engine, windows: Sequence[tuple[int, FloatArray]]) -> li
     if not windows:
         return []
     values = np.stack([held for _, held in windows])  # shape (B, T, C)
-    estimates, _ = engine.identify(values, states=True)
+    estimates, _ = engine.identify(values, states=True, loads=True)
     inputs, rate = len(engine.system.inputs), engine.system.sample_rate
     return [
         Compared(start, rate, held[:, inputs:], estimate.outputs, estimate)

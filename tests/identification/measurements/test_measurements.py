@@ -308,7 +308,7 @@ def test_passengers_change_the_load_and_no_spring(system: System, identifier: Id
 
 def test_what_a_loaded_car_is_simulated_to_do_fits_what_it_did(system: System, identifier: Identifier) -> None:
     values = windows(system, record(5, 7, load=-0.25))
-    shown = identifier.identify(values, states=True)
+    shown = identifier.identify(values, states=True, loads=True)
     assert all(estimate.adequate and estimate.nrmse < 0.05 for estimate in shown), [e.nrmse for e in shown]
 
 
