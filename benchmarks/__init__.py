@@ -56,6 +56,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "real": ("sprung.benchmarks.real", "measured dampers, an axis and a beam, beside references (--data DIR)"),
     "video": ("sprung.benchmarks.real_video", "real videos: the length of their pendulums (--data DIR)"),
     "length": ("sprung.benchmarks.length", "processor time and memory of a diagnosis over the recording's length"),
+    "linear-rigs": (
+        "sprung.benchmarks.linear_rigs",
+        "linear rigs on a shaker, whose values alone are off: what is named on them is false",
+    ),
     "setups": (
         "sprung.benchmarks.setups",
         "wrong set-ups on simulated recordings: signs, channels, nodes, scales, positions, bodies",

@@ -267,6 +267,9 @@ class PlausibleRules:
 class AcceptanceRules:
     """Acceptance of further findings, and compensation of input faults."""
 
+    nearly: float = rule(
+        0.97, "of a linear part's evidence, from which an error of calibration stands for it; chosen", 0.93, 0.99
+    )
     alpha: float = rule(1e-3, "chance of a false finding before the held-out check; chosen: one recording", 1e-4, 1e-2)
     findings: int = rule(6, "that are sought at most; chosen: five, and one to see that there is none", 5, 8)
     minor_beside: float = rule(0.05, "of an earlier finding at the same place; chosen", 0.02, 0.1)

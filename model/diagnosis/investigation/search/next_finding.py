@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from sprung.model.diagnosis.investigation.measurements.calibration import (
     without_calibrations,
 )
 from sprung.model.diagnosis.investigation.measurements.data_sheets import may_be_calibration
-from sprung.model.diagnosis.investigation.measurements.floor import leaves_what_sampling_leaves
+from sprung.model.diagnosis.investigation.measurements.floor import leaves_more_than_noise, leaves_what_sampling_leaves
 from sprung.model.diagnosis.investigation.search.along_motion import law_along_motion
 from sprung.model.diagnosis.investigation.search.masses import imitates_errors
 from sprung.model.diagnosis.investigation.search.minor import is_minor, sought, untried
@@ -100,9 +100,27 @@ def next_finding(state: Investigation, number: int, progress: Progress) -> Inves
     if wide is not None and widened:
         return next_finding(adopt_wider(state, wide), number, progress)
     if not competition.leading:
-        return state
+        return _calibrated_alone(state)
     progress(share_done(number + _FITTED), f"checking {competition.leading[0].term.location}")
     return _with_leading(state, competition, lambda text: progress(share_done(number + _CHECKED), text))
+
+
+def _as_good_error(state: Investigation, chosen: Trial, trials: Sequence[Trial]) -> Trial | None:
+    """The trial that may be an error of calibration, and explains as much as the chosen one or nearly so.
+
+    Such errors exist on every rig; a linear part that explains a little more imitates one.
+    """
+    least = chosen.evidence if chosen.term.law.in_time else state.options.rules.acceptance.nearly * chosen.evidence
+    return next((one for one in trials if one.evidence >= least and may_be_calibration(state, one.term)), None)
+
+
+def _calibrated_alone(state: Investigation) -> Investigation:
+    """The investigation with calibration errors where these alone explain what no candidate does; else as it is."""
+    errors = [one for one in state.last.candidates if may_be_calibration(state, one.term)]
+    if state.calibrations is not None or not errors or not leaves_more_than_noise(state):
+        return state
+    other = calibrated(state, max(errors, key=lambda one: one.score).term)
+    return other if other.calibrations and not leaves_more_than_noise(other) else state
 
 
 def _with_leading(state: Investigation, competition: _Competition, progress: Callable[[str], None]) -> Investigation:
@@ -117,8 +135,9 @@ def _with_leading(state: Investigation, competition: _Competition, progress: Cal
     p_value = _p_value(state, chosen)
     if p_value > state.options.rules.acceptance.alpha:
         return state
-    if state.calibrations is None and (may_be_calibration(state, chosen.term) or imitates_errors(state, chosen)):
-        state = calibrated(state, chosen.term)
+    error = _as_good_error(state, chosen, trials)
+    if state.calibrations is None and (error is not None or imitates_errors(state, chosen)):
+        state = calibrated(state, (error or chosen).term)
         if state.calibrations:
             return state
     if state.refutes(chosen.fit):
