@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks import linear_rigs
+from sprung.model.diagnosis.api import diagnose
 
 RATE = int(linear_rigs.RATE)
 
@@ -32,3 +33,17 @@ def test_accelerations_are_those_of_the_displacements() -> None:
 def test_a_linear_rig_is_consistent_and_its_values_are_right() -> None:
     (line,) = [one for one in linear_rigs.run(2, 5, "noise") if one["measured"] == "acceleration"]
     assert line["verdicts"] == {"consistent": 2} and line["named"] == [] and line["values_beyond"] == 0
+
+
+@pytest.mark.parametrize(
+    ("excitation", "rig"),
+    [
+        ("noise", 3),  # on which nothing leads, but instruments explain everything
+        pytest.param("sweep", 10, marks=pytest.mark.slow),  # on which an inerter explains a little more than a mass
+    ],
+)
+def test_errors_of_instruments_and_masses_are_calibrated_and_no_law(excitation: str, rig: int) -> None:
+    made, true = linear_rigs.made(excitation, "acceleration", np.random.default_rng([700123, rig]))
+    report = diagnose(made.system, made)
+    assert report.verdict == "consistent", report.summary
+    assert all(abs(one.value - true[one.name]) < 3 * one.std for one in report.augmented)
