@@ -11,7 +11,7 @@ from sprung.model.diagnosis.selection.along_measured import disturbed, with_dist
 from sprung.model.system import parse_system
 from tests.diagnosis_cases import MadeRecord
 
-RATE, FINER, SECONDS = 200.0, 10, 12.0
+RATE, FINER, SECONDS = 200.0, 80, 12.0  # a damper acts half a step late, which shows as a spring in series
 GAP, HARD = 2.0e-4, 1.5e5  # m, N/m, of the hooks
 WING = """
 name: wing with a store
@@ -29,7 +29,7 @@ sensors:
 
 
 def shaken() -> MadeRecord:
-    """Force and accelerations, by semi-implicit steps of half a millisecond."""
+    """Force and accelerations, by semi-implicit steps of a sixteenth of a millisecond."""
     random, count, h = np.random.default_rng(8), int(SECONDS * RATE) * FINER, 1 / (RATE * FINER)
     band = butter(3, [3.0, 40.0], "bandpass", fs=RATE * FINER, output="sos")
     force = sosfiltfilt(band, random.standard_normal(count))
