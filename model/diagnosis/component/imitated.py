@@ -49,11 +49,13 @@ def approximate(fit: ComponentFit, base: ComponentFit, alike: Iterable[Equivalen
     """
     if not fit.leaves_more or fit.task.motion.repeats(fit.task.rules):
         return False
-    noise, most = fit.floor**2, fit.task.rules.together
-    if max(fit.error - noise - most * (base.error - noise), fit.held_out - noise - most * (base.held_out - noise)) <= 0:
+    noise, rules = fit.floor**2, fit.task.rules
+    parts = (base.error, fit.error), (base.held_out, fit.held_out)
+    if not any(left - noise > rules.together * (without - noise) for without, left in parts):
         return False
-    laws = {piece.effect for piece in fit.model.pieces}
-    most_held_out = noise + fit.task.rules.as_good * (fit.held_out - noise)
-    others = (one for one in alike if one.effect not in laws and one.fit.leaves_more)
-    others = (one for one in others if one.fit.held_out <= most_held_out)
-    return any(one.fit.model.pieces[one.index].effect_kind is EffectKind.LISTED for one in others)
+    laws, most = {piece.effect for piece in fit.model.pieces}, noise + rules.as_good * (fit.held_out - noise)
+    return any(
+        one.fit.model.pieces[one.index].effect_kind is EffectKind.LISTED
+        for one in alike
+        if one.effect not in laws and one.fit.leaves_more and one.fit.held_out <= most
+    )

@@ -52,9 +52,10 @@ def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgemen
     )
     error, unknown = float(np.sqrt(np.mean(deciding.after**2))), verdict == "unknown_physics"
     rejected = bool(other) or (unknown and error > rules.rejected)
+    reported, suspect = deciding if lost else errors, place or _place(state)
     return Judgement(
         errors=errors,
-        reported=deciding if lost else errors,
+        reported=reported,
         verdict=verdict,
         floor=runs.floor,
         error=error,
@@ -65,8 +66,8 @@ def judged(state: Investigation, runs: HeldOutRuns, ended: str = "") -> Judgemen
         carried=_carries(verdict, physics) and not place,
         imitated=place,
         ended=ended,
-        place=place or _place(state),
-        where=_words(state, deciding if lost else errors, None if lost else runs.after, place or _place(state)),
+        place=suspect,
+        where=_words(state, reported, None if lost else runs.after, suspect),
     )
 
 
