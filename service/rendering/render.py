@@ -63,11 +63,14 @@ def moment(nanoseconds: int) -> Markup:
 
 def quantity(value: float, unit: str) -> str:
     """`1.201 MN/m`: four digits and the prefix that fits; kilograms keep theirs."""
-    if unit != "kg":
-        for factor, prefix in PREFIXES:
-            if abs(value) >= factor:
-                return f"{value / factor:.4g} {prefix}{unit}"
-    return f"{value:.4g} {unit}"
+    factor, scaled = _scaled(value, unit)
+    return f"{value / factor:.4g} {scaled}"
+
+
+def _scaled(value: float, unit: str) -> tuple[float, str]:
+    """The factor that fits a value, and the unit with its prefix."""
+    fitting = ((factor, f"{prefix}{unit}") for factor, prefix in PREFIXES if abs(value) >= factor and unit != "kg")
+    return next(fitting, (1.0, unit))
 
 
 def with_std(value: float, std: float, unit: str) -> tuple[str, str]:
@@ -75,9 +78,9 @@ def with_std(value: float, std: float, unit: str) -> tuple[str, str]:
     deviation, and none of the value beyond those; `quantity` of the value where the deviation is none."""
     if not (math.isfinite(value) and 0 < std < math.inf):
         return quantity(value, unit), ""
-    factor, prefix = next(((f, p) for f, p in PREFIXES if abs(value) >= f and unit != "kg"), (1.0, ""))
+    factor, scaled = _scaled(value, unit)
     digits = max(0, 1 - math.floor(math.log10(std / factor)))
-    return f"{value / factor:.{digits}f}", f"± {std / factor:.{digits}f} {prefix}{unit}"
+    return f"{value / factor:.{digits}f}", f"± {std / factor:.{digits}f} {scaled}"
 
 
 def state(name: str) -> str:

@@ -48,8 +48,7 @@ class Store:
     @property
     def folder(self) -> Path | None:
         """Where an SQLite store lies; None for one on a server."""
-        url = self.engine.url
-        return Path(url.database or "").expanduser().parent if url.get_backend_name() == "sqlite" else None
+        return _folder(self.engine.url)
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
@@ -184,12 +183,18 @@ def _json(value: Any) -> str:
     return to_json(value).decode()
 
 
+def _folder(url: URL) -> Path | None:
+    """Where the file of an SQLite database lies; None of one on a server."""
+    return Path(url.database or "").expanduser().parent if url.get_backend_name() == "sqlite" else None
+
+
 def _full(url: URL) -> str:
     """What SQLite does not say of a disk that has no room for its shared memory: "disk I/O error" is all that comes."""
-    if url.get_backend_name() != "sqlite":
+    folder = _folder(url)
+    if folder is None:
         return ""
     try:
-        free = shutil.disk_usage(Path(url.database or "").expanduser().parent).free
+        free = shutil.disk_usage(folder).free
     except OSError:
         return ""
     return f"; {free / 1e6:.1f} MB are free on its disk" if free < LITTLE_BYTES else ""
