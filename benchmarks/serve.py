@@ -209,6 +209,6 @@ def _serve_echo(port: int) -> None:
 def serve_sprung(port: int, folder: str) -> None:
     """The service on the store of a folder, until the process is ended."""
     settings = Settings(data_dir=Path(folder))
-    with numerics(load_engine(settings), settings) as (engine, following):
-        app = create_app(build_core(settings, engine, following))
+    with numerics(load_engine(settings), settings) as found:
+        app = create_app(build_core(settings, found.engine, found.following, found.processes))
         uvicorn.run(app, port=port, log_level="error", access_log=False)

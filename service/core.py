@@ -42,6 +42,7 @@ from sprung.service.observability.metrics import Metrics
 from sprung.service.observability.queues import WaitMetrics
 from sprung.service.observability.vitals import Vitals, request_histogram
 from sprung.service.operations import Operations
+from sprung.service.processes.forked import ForkedFunctions
 from sprung.service.settings import Settings
 from sprung.service.sources.feed import OnTally
 from sprung.service.sources.live import LiveFeed
@@ -87,6 +88,7 @@ class Core:
     archive: Archive | None = None
     oidc: Provider | None = None  # where people sign in beside their tokens
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
+    processes: Sequence[ForkedFunctions] = ()  # that identify and track
     requests: Histogram | None = None  # durations of requests
 
     def tally_counter(self, source: str) -> OnTally:
@@ -121,8 +123,10 @@ class Core:
             stack.callback(self.ingest.close)
 
 
-def build_core(settings: Settings, engine: Engine, following: Following = follow) -> Core:
-    """Wire the application; `following` feeds windows to trackers.
+def build_core(
+    settings: Settings, engine: Engine, following: Following = follow, processes: Sequence[ForkedFunctions] = ()
+) -> Core:
+    """Wire the application; `following` feeds windows to trackers, `processes` are those in which numerics work.
 
     Raises UserError when the store cannot be opened.
     """
@@ -184,6 +188,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         archive=archive,
         oidc=provider_of(settings),
         feeds=feeds,
+        processes=processes,
     )
     return _observed(core)
 
@@ -204,7 +209,13 @@ def _observed(core: Core) -> Core:
     """With metrics of the whole."""
     queues = {"batches": core.compute, "windows": core.batcher, "jobs": core.jobs}
     waiting = {name: partial(getattr, queue, "waiting") for name, queue in queues.items()}
-    vitals = Vitals(__version__, core.engine.digest, lambda: [feed.status() for feed in core.feeds], waiting)
+    vitals = Vitals(
+        __version__,
+        core.engine.digest,
+        lambda: [feed.status() for feed in core.feeds],
+        waiting,
+        lambda: [process.status for process in core.processes],
+    )
     core.metrics.registry.register(vitals)
     core.requests = request_histogram(core.metrics.registry)
     return core

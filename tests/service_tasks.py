@@ -27,6 +27,11 @@ def misbehave(how: str, emit: Emit[int]) -> str:
         raise KeyError("a mistake of ours")
     if how == "crash":
         os.kill(os.getpid(), signal.SIGSEGV)
+    if how == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if how == "exhaust":
+        while True:
+            pass
     if how == "leave":
         os._exit(7)
     if how == "devour":

@@ -39,6 +39,7 @@ async def ready(core: CoreOf) -> Response:
             "model": core.engine.digest,
             "waiting": core.compute.waiting,
             "feeds": [asdict(feed) for feed in feeds],
+            "processes": [asdict(process.status) for process in core.processes],
         }
     )
 

@@ -392,6 +392,10 @@ class Ready(BaseModel):
     model: str
     waiting: int
     feeds: list[dict[str, Any]] = Field(default_factory=list, description="live buses and how they are")
+    processes: list[dict[str, Any]] = Field(
+        default_factory=list,
+        description="that identify and track; for one that ended the service does so itself until another has begun",
+    )
 
 
 class SystemPart(BaseModel):

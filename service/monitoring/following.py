@@ -116,7 +116,7 @@ def _pass(
 
 
 class FollowingApart:
-    """`follow` in a process of its own, see `service.processes.forked`; here from when that has ended.
+    """`follow` in a process of its own, see `service.processes.forked`; here while that has none.
 
     The process keeps the states that it has made last, so that they are sent in one direction only.
     """
@@ -126,14 +126,19 @@ class FollowingApart:
         self._tracker = engine.tracker
         self._most = vehicles
         self._there: OrderedDict[_Key, TrackerState] = OrderedDict()  # what the process knows
+        self._process = 0  # whose knowledge that is
         self._lock = threading.Lock()
         self.forked = ForkedFunctions("tracks vehicles", {"follow": _Follower(engine).follow})
 
     def __call__(self, asked: Sequence[WindowsToFold], now: int) -> Generator[FollowedWindows, None, None]:
         """As `follow`; the process works on the next vehicle while the caller does something with one."""
-        with self._lock, closing(self._apart([one for one in asked if self._is_mine(one)], now)) as apart:
-            for one in asked:
-                yield next(apart if self._is_mine(one) else follow([one], now))
+        with self._lock, self.forked.undisturbed() as process:
+            if process != self._process:
+                self._there.clear()
+                self._process = process
+            with closing(self._apart([one for one in asked if self._is_mine(one)], now)) as apart:
+                for one in asked:
+                    yield next(apart if self._is_mine(one) else follow([one], now))
 
     def _apart(self, asked: Sequence[WindowsToFold], now: int) -> Generator[FollowedWindows, None, None]:
         """Of vehicles that the process follows."""

@@ -10,7 +10,6 @@ from typing import Any
 from cachetools import LRUCache
 
 from sprung.model.identifier import Identifies, StageTimes
-from sprung.model.laws import Law
 from sprung.model.schema import SystemFile
 from sprung.model.signals import BoolArray, Estimate, FloatArray, MeasurementFault
 from sprung.model.system import System
@@ -22,7 +21,7 @@ NICE = 10  # of that process: where processors are scarce, the windows of all ot
 
 
 class IdentifierApart:
-    """An identifier in a process of its own; in this one from when that has ended."""
+    """An identifier in a process of its own; in this one while there is none."""
 
     def __init__(self, here: Identifies, ask: Callable[..., Any]) -> None:
         """ask: as `_asked`, in the process."""
@@ -51,12 +50,12 @@ class IdentifierApart:
         return list(found)
 
 
-def identifying_processes(identifier: Identifies, catalogue: Sequence[Law]) -> tuple[ForkedFunctions, ForkedFunctions]:
+def identifying_processes(identifier: Identifies, system: System) -> tuple[ForkedFunctions, ForkedFunctions]:
     """Two processes: for windows of vehicles with the service's system file, and for those of vehicles with their own.
 
-    catalogue: of laws, by which system files are read.
+    system: the service's, by whose laws the system files of vehicles are read.
     """
-    shared, own = {"ask": partial(_asked, identifier)}, {"ask": _OwnIdentifiers(catalogue).ask}
+    shared, own = {"ask": partial(_asked, identifier)}, {"ask": _OwnIdentifiers(system).ask}
     return (
         ForkedFunctions("identifies windows", shared, one_thread_an_operation),
         ForkedFunctions("identifies windows with vehicles' own models", own, _begin_behind),
@@ -79,15 +78,15 @@ def _begin_behind() -> None:
 class _OwnIdentifiers:
     """The last ones that were asked for, in the process for vehicles with models of their own."""
 
-    def __init__(self, catalogue: Sequence[Law]) -> None:
-        self._catalogue = tuple(catalogue)
+    def __init__(self, system: System) -> None:
+        self._shared = system
         self._held: LRUCache[str, Identifies] = LRUCache(KEPT)
 
     def ask(self, digest: str, file: SystemFile, what: str, *given: Any, **named: Any) -> tuple[Any, StageTimes]:
         """As `_asked`, of the identifier of a system file."""
         identifier = self._held.get(digest)
         if identifier is None:
-            identifier = self._held[digest] = own_identifier(System(file, self._catalogue))
+            identifier = self._held[digest] = own_identifier(System(file, self._shared.catalogue))
         return _asked(identifier, what, *given, **named)
 
 

@@ -10,6 +10,7 @@ from prometheus_client import CollectorRegistry, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from sprung.service.processes.forked import ProcessStatus
 from sprung.service.sources.live import FeedStatus
 
 STATES = ("receiving", "silent", "behind", "down", "failing", "hung", "ended")
@@ -31,7 +32,12 @@ class Vitals(Collector):
     """Reads what it is given at every scrape."""
 
     def __init__(
-        self, version: str, model: str, feeds: Callable[[], list[FeedStatus]], gauges: Mapping[str, Callable[[], float]]
+        self,
+        version: str,
+        model: str,
+        feeds: Callable[[], list[FeedStatus]],
+        gauges: Mapping[str, Callable[[], float]],
+        processes: Callable[[], list[ProcessStatus]] = list,
     ) -> None:
         """gauges: by what waits, as in `windows`, `jobs`."""
         self._build = {
@@ -42,6 +48,7 @@ class Vitals(Collector):
         }
         self._feeds = feeds
         self._waiting = gauges
+        self._processes = processes
 
     def describe(self) -> Iterator[Metric]:
         """Nothing is collected at registration."""
@@ -55,6 +62,7 @@ class Vitals(Collector):
             waiting.add_metric([name], count())
         yield waiting
         yield from _feed_families(self._feeds())
+        yield from _process_families(self._processes())
 
 
 def _feed_families(feeds: list[FeedStatus]) -> Iterator[Metric]:
@@ -73,3 +81,14 @@ def _feed_families(feeds: list[FeedStatus]) -> Iterator[Metric]:
         lost.add_metric([feed.name, "frames dropped by the kernel"], feed.lost_frames)
         restarts.add_metric([feed.name], feed.restarts)
     yield from (state, connected, lag, lost, restarts)
+
+
+def _process_families(processes: list[ProcessStatus]) -> Iterator[Metric]:
+    up = GaugeMetricFamily("sprung_process_up", "Whether a process of the numerics runs", labels=["process"])
+    restarts = CounterMetricFamily(
+        "sprung_process_restarts", "Processes that took another one's place", labels=["process"]
+    )
+    for process in processes:
+        up.add_metric([process.name], float(process.works))
+        restarts.add_metric([process.name], process.restarts)
+    yield from (up, restarts)

@@ -38,11 +38,16 @@ POLL_SECONDS = 0.1
 START_SECONDS = 600.0  # to import what a task needs: seconds of work, minutes where the machine has no time
 END_SECONDS = 5.0  # a process that was killed is gone long before
 PR_SET_PDEATHSIG = 1
+FROM_OUTSIDE = ("SIGKILL", "SIGTERM", "SIGHUP", "SIGQUIT")  # nothing that runs in a process sends itself these
 _starting = threading.Lock()
 
 
 class WorkerFailed(RuntimeError):
     """The work failed with an error that is not meant for users; the message is its traceback."""
+
+
+class WorkerKilled(UserError):
+    """The process was ended from outside, or for want of memory: the same work may succeed another time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +100,13 @@ class Worker(Generic[Message, Result]):
         self._connection, theirs = context.Pipe()
         self._process = context.Process(
             target=_run,
-            args=(_Tether(os.getpid()), task, request, theirs, limits),  # the tether first: see there
+            args=(Tether(os.getpid()), task, request, theirs, limits),  # the tether first: see there
             name="sprung-worker",
             daemon=True,
         )
         self._started = time.monotonic()
         self._begun: float | None = None
-        with _without_program():
+        with without_program():
             self._process.start()
         theirs.close()
 
@@ -120,8 +125,8 @@ class Worker(Generic[Message, Result]):
         """The task's messages, as they come; ends when the task is done.
 
         check: called ten times a second, may raise to give up; the process is then ended.
-        Raises UserError for input that cannot be used, for limits that are exceeded and for a process that died;
-        WorkerFailed for an error of the program.
+        Raises UserError for input that cannot be used, for limits that are exceeded and for a process that died, as
+        WorkerKilled where that may have come from outside; WorkerFailed for an error of the program.
         """
         try:
             while True:
@@ -163,20 +168,24 @@ class Worker(Generic[Message, Result]):
                     raise UserError(f"{self._what} made no progress for {self._limits.silence_seconds:.0f} s")
         except (EOFError, OSError, pickle.UnpicklingError):
             check()
-            raise UserError(self._death()) from None
+            raise self._death() from None
 
-    def _death(self) -> str:
+    def _death(self) -> UserError:
+        """What is known of the end of the process."""
         self._process.join(END_SECONDS)
         code = self._process.exitcode
-        if code is not None and code < 0:
-            name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
-            if name == "SIGXCPU" or (name == "SIGKILL" and self._limits.cpu_seconds is not None):
-                return f"{self._what} took more than {self._limits.cpu_seconds} s of processor time, or memory ran out"
-            return f"the process of {self._what} was ended by {name}: it crashed, or it used more memory than there is"
-        return f"the process of {self._what} ended without an answer (status {code})"
+        if code is None or code >= 0:
+            return UserError(f"the process of {self._what} ended without an answer (status {code})")
+        name = signal.Signals(-code).name if -code in set(signal.Signals) else "a signal"
+        if name == "SIGXCPU":
+            return UserError(f"{self._what} took more than {self._limits.cpu_seconds} s of processor time")
+        told = f"the process of {self._what} was ended by {name} (signal {-code})"
+        if name in FROM_OUTSIDE:
+            return WorkerKilled(f"{told}: the machine was out of memory, or it was ended from outside")
+        return UserError(f"{told}: it crashed")
 
 
-class _Tether:
+class Tether:
     """Ties a new process to its parent as soon as this is unpickled there, before a task's imports take their time."""
 
     def __init__(self, parent: int) -> None:
@@ -198,7 +207,7 @@ def tie(parent: int) -> int:
 
 
 @contextmanager
-def _without_program() -> Iterator[None]:
+def without_program() -> Iterator[None]:
     """A new process imports the module of its task, and not the program of this one as well: that may be Ray's, which
     takes a second, or a script of somebody who uses Sprung, which would run again."""
     with _starting:
@@ -272,4 +281,6 @@ def be_modest(limits: ProcessLimits) -> None:
         if limits.memory_bytes is not None:
             resource.setrlimit(resource.RLIMIT_DATA, (limits.memory_bytes, limits.memory_bytes))
         if limits.cpu_seconds is not None:
-            resource.setrlimit(resource.RLIMIT_CPU, (limits.cpu_seconds, limits.cpu_seconds))
+            # beyond it SIGXCPU, which says what it was; the second bound, that of SIGKILL, is never reached
+            resource.setrlimit(resource.RLIMIT_CPU, (limits.cpu_seconds, limits.cpu_seconds + 60))
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # which SIGXCPU would write

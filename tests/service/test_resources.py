@@ -7,13 +7,16 @@ import sqlite3
 import threading
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
+from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.monitoring.engine import Engine
+from sprung.service.processes.forked import ProcessStatus
 from sprung.service.settings import Settings
 
 
@@ -40,6 +43,19 @@ def test_a_disk_that_fills_is_not_ready(client: TestClient, monkeypatch: pytest.
     monkeypatch.setattr("sprung.service.condition.free_bytes", lambda folder: -1)
     answer = client.get("/health/ready")
     assert answer.status_code == 503 and "MB are free" in answer.json()["detail"]
+
+
+def test_a_process_that_is_replaced_is_shown_and_the_service_is_ready(engine: Engine, data_dir: Path) -> None:
+    """The service does its work meanwhile."""
+    lost = Mock(status=ProcessStatus("tracks vehicles", works=False, restarts=2))
+    core = build_core(Settings(data_dir=data_dir, min_free_bytes=0), engine, processes=[lost])
+    with TestClient(create_app(core)) as client:
+        answer = client.get("/health/ready")
+        assert answer.status_code == 200
+        assert answer.json()["processes"] == [{"name": "tracks vehicles", "works": False, "restarts": 2}]
+        metrics = client.get("/metrics").text
+    assert 'sprung_process_up{process="tracks vehicles"} 0.0' in metrics
+    assert 'sprung_process_restarts_total{process="tracks vehicles"} 2.0' in metrics
 
 
 @pytest.mark.parametrize(

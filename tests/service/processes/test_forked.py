@@ -29,6 +29,7 @@ from sprung.service.monitoring.following import FollowingApart, follow
 from sprung.service.monitoring.identifier_processes import IdentifierApart, identifying_processes, placed_in
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import WindowsToFold
+from sprung.service.processes import forked
 from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
 from sprung.service.store import Store, open_store
 from tests.service_fakes import make_window
@@ -53,8 +54,8 @@ def _doubles(values: list[int]) -> Iterator[int]:
 @pytest.fixture
 def doubling() -> Iterator[ForkedFunctions]:
     functions: dict[str, Callable[..., Any]] = {"double": _double, "pid": os.getpid, "doubles": _doubles}
-    with closing(ForkedFunctions("doubles", functions)) as forked:
-        yield forked
+    with closing(ForkedFunctions("doubles", functions)) as doubles:
+        yield doubles
 
 
 def _in_eight_threads() -> float:
@@ -73,8 +74,8 @@ def test_threads_of_the_process_may_use_torch_at_the_same_moment() -> None:
     one_thread_an_operation()
     torch.ones(100_000) + 1.0
     for _ in range(20):
-        with closing(ForkedFunctions("adds", {"add": _in_eight_threads}, one_thread_an_operation)) as forked:
-            assert forked.call("add") == 8 * 200_000
+        with closing(ForkedFunctions("adds", {"add": _in_eight_threads}, one_thread_an_operation)) as adding:
+            assert adding.call("add") == 8 * 200_000
 
 
 def test_functions_run_in_another_process(doubling: ForkedFunctions) -> None:
@@ -125,6 +126,82 @@ def test_a_killed_process_is_reported_once(doubling: ForkedFunctions, caplog: py
     assert len(caplog.records) == 1 and doubling.pid is None
 
 
+def _until(there: Callable[[], bool], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not there():
+        assert time.monotonic() < deadline, "it does not come to that"
+        time.sleep(0.02)
+
+
+def test_a_killed_process_is_replaced_without_being_asked(
+    doubling: ForkedFunctions, caplog: pytest.LogCaptureFixture
+) -> None:
+    doubling.watch()
+    for restarts in (1, 2):
+        before = doubling.pid
+        assert before is not None and doubling.status.works
+        os.kill(before, signal.SIGKILL)
+        _until(lambda count=restarts: doubling.status.restarts == count)  # type: ignore[misc]
+        assert doubling.call("double", 4) == 8 and doubling.call("pid") == doubling.pid != before
+        with pytest.raises(UnusableWindow, match="a negative one"):
+            doubling.call("double", -1)
+    told = [record.message for record in caplog.records]
+    assert [("ended (status -9)" in line, "runs again" in line) for line in told] == [(True, False), (False, True)] * 2
+
+
+def test_a_process_that_is_stopped_is_replaced_and_who_asks_does_not_wait_for_ever(
+    doubling: ForkedFunctions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(forked, "STOPPED_SECONDS", 1.0)
+    doubling.watch()
+    assert doubling.pid is not None
+    os.kill(doubling.pid, signal.SIGSTOP)
+    begun = time.monotonic()
+    with pytest.raises(ProcessEnded):
+        doubling.call("double", 1)
+    assert time.monotonic() - begun < 20.0
+    _until(lambda: doubling.status.works)
+    assert doubling.call("double", 2) == 4
+
+
+def test_a_process_whose_threads_wait_for_each_other_is_replaced_and_one_at_work_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(forked, "IDLE_SECONDS", 1.5)
+    functions: dict[str, Callable[..., Any]] = {"wait": _for_ever, "work": _seconds_of_work}
+    with closing(ForkedFunctions("waits", functions)) as waiting:
+        waiting.watch()
+        assert waiting.call("work", 4.0) == 4.0
+        with pytest.raises(ProcessEnded):
+            waiting.call("wait")
+        time.sleep(3.0)  # nobody asks anything: that is no reason
+        _until(lambda: waiting.status.restarts == 1)
+        time.sleep(3.0)
+        assert waiting.call("work", 0.1) == 0.1 and waiting.status.restarts == 1
+
+
+def _for_ever() -> None:
+    threading.Event().wait()
+
+
+def _seconds_of_work(seconds: float) -> float:
+    begun = time.process_time()
+    while time.process_time() - begun < seconds:
+        pass
+    return seconds
+
+
+def test_closing_does_not_wait_for_a_process_that_is_just_being_started(doubling: ForkedFunctions) -> None:
+    doubling.watch()
+    assert doubling.pid is not None
+    os.kill(doubling.pid, signal.SIGKILL)
+    _until(lambda: doubling.pid is None)
+    time.sleep(1.2)
+    begun = time.monotonic()
+    doubling.close()
+    assert time.monotonic() - begun < 5.0
+
+
 def test_it_ends_with_the_process_that_made_it(tmp_path: Path) -> None:
     told = tmp_path / "pid"
     maker = os.fork()
@@ -169,7 +246,7 @@ def test_calls_of_several_threads_get_their_own_answers(doubling: ForkedFunction
 
 
 def test_an_identifier_apart_answers_as_it_does_here(engine: Engine, system: System) -> None:
-    shared, own = identifying_processes(engine.identifier, system.catalogue)
+    shared, own = identifying_processes(engine.identifier, system)
     apart = IdentifierApart(engine.identifier, partial(shared.call, "ask"))
     values = np.stack([make_window(system, n).values for n in range(3)])
     with closing(shared), closing(own):
@@ -185,8 +262,27 @@ def test_an_identifier_apart_answers_as_it_does_here(engine: Engine, system: Sys
                 os.kill(shared.pid, signal.SIGKILL)
 
 
+def test_identifiers_that_take_the_place_of_others_come_to_the_same(engine: Engine, system: System) -> None:
+    shared, own = identifying_processes(engine.identifier, system)
+    values = np.stack([make_window(system, n).values for n in range(3)])
+    with closing(shared), closing(own):
+        there = replace(engine, identifier=IdentifierApart(engine.identifier, partial(shared.call, "ask")))
+        here, _ = engine.identify(values, starts=[0, 1, 2])
+        for process in (shared, own):
+            assert process.pid is not None
+            os.kill(process.pid, signal.SIGKILL)
+            process.watch()
+        _until(lambda: shared.status.works and shared.status.restarts == own.status.restarts == 1)
+        assert own.pid is not None and shared.pid is not None
+        assert os.getpriority(os.PRIO_PROCESS, own.pid) > os.getpriority(os.PRIO_PROCESS, shared.pid)
+        found, _ = there.identify(values, starts=[0, 1, 2])
+        for one, other in zip(here, found, strict=True):
+            np.testing.assert_array_equal(one.log_ratio, other.log_ratio)
+            np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
 def test_a_vehicles_own_model_is_identified_apart_and_behind_the_others(engine: Engine, system: System) -> None:
-    shared, own = identifying_processes(engine.identifier, system.catalogue)
+    shared, own = identifying_processes(engine.identifier, system)
     with closing(shared), closing(own):
         served = replace(engine, place=placed_in(own))
         other = parse_system(MANCHESTER.read_text().replace("mass: 32000", "mass: 33000"))
@@ -207,9 +303,12 @@ def test_a_vehicles_own_model_is_identified_apart_and_behind_the_others(engine: 
         assert seconds_of_a_window(here) > 0.0
 
 
-@pytest.mark.parametrize("vehicles", [1, 10])
-def test_trackers_apart_come_to_the_same(engine: Engine, system: System, tmp_path: Path, vehicles: int) -> None:
-    """With room for one vehicle in the process, and for all; it is killed on the way."""
+@pytest.mark.parametrize(("vehicles", "watched"), [(1, False), (10, False), (10, True)])
+def test_trackers_apart_come_to_the_same(
+    engine: Engine, system: System, tmp_path: Path, vehicles: int, watched: bool
+) -> None:
+    """With room for one vehicle in the process, and for all; it is killed on the way, and replaced where it is watched:
+    the other one knows no vehicle."""
     states = {}
     for name in ("here", "apart"):
         following = FollowingApart(engine, vehicles) if name == "apart" else None
@@ -222,6 +321,9 @@ def test_trackers_apart_come_to_the_same(engine: Engine, system: System, tmp_pat
                 _relearn(pipeline, store)
             if part == 2 and following is not None and following.forked.pid is not None:
                 os.kill(following.forked.pid, signal.SIGKILL)
+                if watched:
+                    following.forked.watch()
+                    _until(lambda process=following.forked: process.status.restarts == 1)  # type: ignore[misc]
         states[name] = [pipeline.state(vehicle).to_dict() for vehicle in ("a", "b")]
         if following is not None:
             following.forked.close()

@@ -9,13 +9,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from sprung.model.system import load_system
 from sprung.service.errors import UserError
-from sprung.service.processes.worker import ProcessLimits, Worker, WorkerFailed
+from sprung.service.processes.worker import ProcessLimits, Worker, WorkerFailed, WorkerKilled
 from tests import service_slow, service_tasks
 from tests.service_tasks import count, misbehave
 
@@ -66,15 +67,23 @@ def test_the_program_that_starts_a_worker_is_not_run_again(tmp_path: Path) -> No
     [
         ("refuse", UserError, "line 3 is no number"),
         ("break", WorkerFailed, "a mistake of ours"),
-        ("crash", UserError, "the process of the work was ended by SIGSEGV"),
+        ("crash", UserError, r"the process of the work was ended by SIGSEGV \(signal 11\): it crashed"),
+        (
+            "killed",
+            WorkerKilled,
+            r"was ended by SIGKILL \(signal 9\): the machine was out of memory, or it was ended from",
+        ),
+        ("exhaust", UserError, "the work took more than 1 s of processor time"),
         ("leave", UserError, r"the process of the work ended without an answer \(status 7\)"),
     ],
 )
 def test_every_end_is_reported_for_what_it_was(how: str, error: type[Exception], told: str) -> None:
-    worker: Worker[int, str] = Worker(misbehave, how, EASY, "the work")
-    with pytest.raises(error, match=told):
+    worker: Worker[int, str] = Worker(
+        misbehave, how, replace(EASY, cpu_seconds=1 if how == "exhaust" else 60), "the work"
+    )
+    with pytest.raises(error, match=told) as caught:
         list(worker.messages())
-    assert gone(worker.pid)
+    assert gone(worker.pid) and isinstance(caught.value, WorkerKilled) == (how == "killed")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the bound is one of Linux")
