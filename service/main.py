@@ -14,7 +14,7 @@ from functools import partial
 from math import inf
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
@@ -31,7 +31,7 @@ from sprung.service.lock import held
 from sprung.service.monitoring.engine import load_engine
 from sprung.service.monitoring.numerics import numerics
 from sprung.service.observability.connections import ConnectionCollector
-from sprung.service.processes.worker import ProcessLimits
+from sprung.service.processes.worker import ProcessLimits, WorkerKilled
 from sprung.service.retrying import retry
 from sprung.service.settings import Settings
 from sprung.service.sources.feed import FeedResult, OnBatch, feed_file, vehicle_of
@@ -67,10 +67,10 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
     check_access(settings)
     loaded = load_engine(settings)
     with ExitStack() as stack:
-        engine, following = stack.enter_context(numerics(loaded, settings))
+        found = stack.enter_context(numerics(loaded, settings))
         stack.enter_context(held(settings.data_dir))
         listening = stack.enter_context(listen(settings))
-        core = build_core(settings, engine, following)
+        core = build_core(settings, found.engine, found.following, found.processes)
         stack.callback(core.close)
         notice = access_notice(settings, core.tokens.any or core.oidc is not None)
         add_live_feeds(core, feeds)
@@ -150,6 +150,15 @@ def _limits(settings: Settings, path: Path, speed: float) -> ProcessLimits:
     return replace(limits, seconds=inf, silence_seconds=inf if speed else limits.silence_seconds)
 
 
+def _once_more(feed: Callable[..., FeedResult], *given: Any, **named: Any) -> FeedResult:
+    """Again, where the process that read the recording was ended: what is stored already is not stored twice."""
+    try:
+        return feed(*given, **named)
+    except WorkerKilled as error:
+        log.error("%s; it is tried once more", error)
+        return feed(*given, **named)
+
+
 def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
     def check() -> None:
         if core.stopping.is_set():
@@ -160,7 +169,8 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
         try:
             row = file_row(path, feeds.start)
             retry(partial(add_row, core.store, row), path.name, check)
-            fed = feed_file(
+            fed = _once_more(
+                feed_file,
                 core.pipeline,
                 path,
                 vehicle=feeds.vehicle,

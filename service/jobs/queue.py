@@ -1,9 +1,9 @@
 """Work that goes on after its request was answered: a thread for each kind, a bounded queue, everything in the store.
 
 What was accepted survives: a job that a stop interrupts is queued again and goes on at the next start (windows are
-stored once, so doing a part twice changes nothing).  A job that was at work when its process died is tried once more,
-and then failed: a recording must not take the service down at every start.  One that the store or the disk refuses goes
-on when they take things again.
+stored once, so doing a part twice changes nothing).  A job that was at work when the process died, the service's or its
+own, is tried once more, and then failed: a recording must not take the service down at every start.  One that the store
+or the disk refuses goes on when they take things again.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sprung.model.text import first_line
 from sprung.service.errors import Busy, NotFound, UserError
 from sprung.service.observability.queues import WaitMetrics
+from sprung.service.processes.worker import WorkerKilled
 from sprung.service.retrying import message_of, retry
 from sprung.service.store import Store, audit, work
 from sprung.service.times import NANOSECONDS, now_ns
@@ -261,6 +262,8 @@ class Jobs:
         finally:
             del self._current[job_id]
         self._finish(job_id, values)
+        if values["state"] == "queued":
+            self._enqueue(job)
         if self._waits is not None:
             self._waits.job(job.kind, values["state"], time.monotonic() - started)
         log.info(
@@ -279,6 +282,13 @@ class Jobs:
             return {"state": "queued", "attempts": job.attempts}  # an end in good order is no attempt
         except Cancelled:
             return {"state": "failed", "attempts": job.attempts}
+        except WorkerKilled as error:
+            attempts = job.attempts + 1
+            if attempts < MOST_ATTEMPTS:
+                log.error("job %s (%s): %s; it is tried once more", job.id, job.kind, error)
+                return {"state": "queued", "attempts": attempts}
+            log.error("job %s (%s): %s, %d times", job.id, job.kind, error, attempts)
+            return {"state": "failed", "error": f"{error}, {attempts} times"[:500], "attempts": attempts}
         except UserError as error:
             return {"state": "failed", "error": str(error)[:500], "attempts": job.attempts}
         except Exception:

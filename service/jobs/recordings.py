@@ -11,7 +11,7 @@ from sprung.service.errors import UserError
 from sprung.service.jobs.queue import Progress
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import Batch
-from sprung.service.processes.worker import ProcessLimits
+from sprung.service.processes.worker import ProcessLimits, WorkerKilled
 from sprung.service.settings import Settings
 from sprung.service.sources.feed import FeedResult, OnTally, feed_file
 from sprung.service.sources.reading import SLOWEST_BYTES_PER_SECOND
@@ -52,7 +52,8 @@ class RecordingJobs:
                 retrying=True,
             )
         except (UnreadableRecording, UserError) as error:
-            raise UserError(str(error).replace(str(path), row.name)) from error
+            told = str(error).replace(str(path), row.name)
+            raise (WorkerKilled if isinstance(error, WorkerKilled) else UserError)(told) from error
         progress.retry(lambda: finish_row(self._pipeline.store, row, fed))
         return {"recording": row.id} | fed.summary()
 

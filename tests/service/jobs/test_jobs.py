@@ -20,7 +20,7 @@ from sprung.service.diagnosis.worker import within
 from sprung.service.errors import UserError
 from sprung.service.jobs.queue import Jobs, Kind, Progress
 from sprung.service.monitoring.engine import Engine
-from sprung.service.processes.worker import Emit
+from sprung.service.processes.worker import Emit, WorkerKilled
 from sprung.service.settings import Settings
 from sprung.service.store import Store, work
 from sprung.service.store.work import JobRow
@@ -58,6 +58,29 @@ def test_a_job_that_killed_its_process_twice_is_failed(store: Store, attempts: i
     assert stored(store, job).state == becomes
     if becomes == "failed":
         assert "died 2 times" in (stored(store, job).error or "")
+
+
+@pytest.mark.parametrize(("kills", "becomes"), [(1, "done"), (2, "failed")])
+def test_a_job_whose_own_process_was_killed_is_tried_once_more(
+    store: Store, caplog: pytest.LogCaptureFixture, kills: int, becomes: str
+) -> None:
+    left = [kills]
+
+    def killed(_job: JobRow, _progress: Progress) -> dict[str, Any]:
+        left[0] -= 1
+        if left[0] >= 0:
+            raise WorkerKilled("the process was ended by SIGKILL")
+        return {}
+
+    jobs = Jobs(store, {"toy": Kind(killed, 60)}, 4)
+    jobs.start()
+    job = jobs.submit("toy")
+    eventually(lambda: stored(store, job.id).state not in work.UNFINISHED)
+    assert stored(store, job.id).state == becomes and jobs.waiting == 0
+    error = None if becomes == "done" else "the process was ended by SIGKILL, 2 times"
+    assert stored(store, job.id).error == error
+    assert ["tried once more" in record.message for record in caplog.records] == [True, False][:kills]
+    jobs.close()
 
 
 def test_the_attempt_is_in_the_store_while_the_job_runs_and_gone_after_a_stop_in_order(store: Store) -> None:
@@ -225,6 +248,7 @@ def test_a_diagnosis_that_breaks_fails_and_the_next_one_works(core: Core, name: 
     with TestClient(create_app(core)) as client:
         bad, good = ask_for(client, name), ask_for(client, "good.mcap")
         assert eventually(lambda: stored(core.store, good).state == "done")
+        assert eventually(lambda: stored(core.store, bad).state == "failed")  # a deadly one is tried twice
         assert told in (stored(core.store, bad).error or "")
         assert [path.name for path in core.settings.reports.iterdir()] == [good]
 

@@ -7,7 +7,7 @@ import math
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,11 @@ from sprung.service.main import Feeds, _feed_files, _limits, live_feed
 from sprung.service.monitoring.compute import Compute
 from sprung.service.monitoring.engine import Engine, make_tracker
 from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.processes.worker import WorkerKilled
 from sprung.service.settings import Settings
 from sprung.service.sources.feed import feed_file, vehicle_of
 from sprung.service.sources.live import LiveFeed
-from sprung.service.sources.reading import prefetched
+from sprung.service.sources.reading import ProcessReading, ReadWindows, prefetched
 from sprung.service.store import open_store, work
 from sprung.service.store.work import JobRow
 from tests.service_fakes import START, FakeIdentifier, diagnose, eventually, hold, make_window
@@ -159,6 +160,25 @@ def test_a_store_that_refuses_for_a_while_costs_no_recording(
         _feed_files(core, feeds, lambda path, core: (lambda batch: None, lambda fed: ended.set()))
         assert ended.is_set()
     assert refusals["keep"] == refusals["identify"] == 0
+    assert client.get("/vehicles/bus-7").json()["windows"]["used"] == 9
+
+
+def test_a_recording_whose_reading_process_is_killed_is_read_once_more(
+    client: TestClient, core: Core, recording: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Killed with its last piece, so that all of it is stored before."""
+    began, ended, real = [0], threading.Event(), ProcessReading.pieces
+
+    def killed(self: ProcessReading, check: Callable[[], None]) -> Iterator[ReadWindows]:
+        began[0] += 1
+        yield from real(self, check)
+        if began[0] == 1:
+            raise WorkerKilled("the process of the reading of the recording was ended by SIGKILL")
+
+    monkeypatch.setattr(ProcessReading, "pieces", killed)
+    feeds = Feeds((recording,), vehicle="bus-7")
+    _feed_files(core, feeds, lambda path, core: (lambda batch: None, lambda fed: ended.set()))
+    assert ended.is_set() and began == [2] and "it is tried once more" in caplog.text
     assert client.get("/vehicles/bus-7").json()["windows"]["used"] == 9
 
 
