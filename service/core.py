@@ -152,7 +152,8 @@ def build_core(
     )
     pipeline.aging = housekeeping.clock.read
     rings = Rings(settings.ring_vehicles, settings.ring_seconds, len(engine.system.channels), engine.system.sample_rate)
-    rides, hub, alarm_signals = Rides(settings.parameter_series_vehicles), Hub(), AlarmSignals(settings, store, rings)
+    alarm_signals = AlarmSignals(settings, store, rings, housekeeping.clock.read)
+    rides, hub = Rides(settings.parameter_series_vehicles), Hub()
     metrics.registry.register(RideCollector(rides))
     diagnosis_jobs = DiagnosisJobs(settings, pipeline, on_report=notices.report)
     jobs = _jobs(settings, pipeline, metrics, diagnosis_jobs, waits)
@@ -230,7 +231,7 @@ def _jobs(
         "recording": Kind(recordings.run, settings.recording_seconds),
         "diagnosis": Kind(diagnosis.run, settings.diagnosis_seconds),
     }
-    return Jobs(pipeline.store, kinds, settings.job_queue, waits)
+    return Jobs(pipeline.store, kinds, settings.job_queue, waits, pipeline.aging)
 
 
 def tally_counter(metrics: Metrics, source: str) -> OnTally:

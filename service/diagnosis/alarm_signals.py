@@ -6,8 +6,8 @@ They are recordings of the source `alarm`: housekeeping, back-up and the deletio
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
@@ -41,7 +41,9 @@ class Stretch:
 class AlarmSignals:
     """Keeps them when an alarm is raised.  Safe to share between threads."""
 
-    def __init__(self, settings: Settings, store: Store, rings: Rings) -> None:
+    def __init__(self, settings: Settings, store: Store, rings: Rings, aging: Callable[[], int] = now_ns) -> None:
+        """aging: the clock by which what is kept ages, ns since 1970."""
+        self._aging = aging
         self._settings = settings
         self._store = store
         self._rings = rings
@@ -74,6 +76,7 @@ class AlarmSignals:
         with kept_excerpt(self._settings.uploads, excerpt) as path:
             size = path.stat().st_size
             row = RecordingRow(work.new_id(), vehicle, label, ALARM_SOURCE, path.name, size, about, now, now)
+            row = replace(row, kept_since_ns=self._aging())
             with self._store.write() as connection:
                 files = [path.name]
                 if fleet.vehicle_exists(connection, vehicle):  # it may have been deleted meanwhile

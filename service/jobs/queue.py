@@ -13,7 +13,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 from sqlalchemy import Connection
@@ -113,8 +113,15 @@ class Jobs:
     """Accepts jobs and works through those of a kind in order; a recording does not wait for a diagnosis of minutes."""
 
     def __init__(
-        self, store: Store, kinds: Mapping[str, Kind], queue_size: int, waits: WaitMetrics | None = None
+        self,
+        store: Store,
+        kinds: Mapping[str, Kind],
+        queue_size: int,
+        waits: WaitMetrics | None = None,
+        aging: Callable[[], int] = now_ns,
     ) -> None:
+        """aging: the clock by which files of recordings age, ns since 1970."""
+        self._aging = aging
         self._waits = waits
         self._store = store
         self._kinds = kinds
@@ -165,7 +172,7 @@ class Jobs:
         recording_id = None if recording is None else recording.id
         with self._store.write() as connection:
             if recording is not None and work.get_recording(connection, recording.id) is None:
-                work.add_recording(connection, recording)
+                work.add_recording(connection, replace(recording, kept_since_ns=self._aging()))
             if recording_id is not None:
                 waiting = work.waiting_job(connection, kind, recording_id, vehicle)
                 if waiting is not None:

@@ -165,7 +165,7 @@ def _drop_for_room(connection: Connection, limit: int, keep: Keep) -> tuple[int,
 
 
 def _old_uploads(connection: Connection, before: int) -> list[str]:
-    old = (recordings.c.created_ns < before) & (recordings.c.created_ns >= CLOCK_WAS_SET_NS)
+    old = (_kept_since() < before) & (_kept_since() >= CLOCK_WAS_SET_NS)
     return _release(connection, [row.id for row in _finished(connection, old)])
 
 
@@ -205,11 +205,15 @@ def _kept() -> Any:
     return recordings.c.file.is_not(None)
 
 
+def _kept_since() -> Any:
+    return func.coalesce(recordings.c.kept_since_ns, recordings.c.created_ns)
+
+
 def _finished(connection: Connection, condition: Any) -> list[Any]:
     """Recordings with a file that no job needs any more, oldest first."""
     in_use = select(jobs.c.recording_id).where(jobs.c.state.in_(UNFINISHED), jobs.c.recording_id.is_not(None))
     query = select(recordings.c.id, recordings.c.size_bytes).where(_kept(), condition, recordings.c.id.not_in(in_use))
-    return list(connection.execute(query.order_by(recordings.c.created_ns)))
+    return list(connection.execute(query.order_by(_kept_since())))
 
 
 def _release(connection: Connection, ids: list[str]) -> list[str]:

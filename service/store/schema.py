@@ -107,6 +107,7 @@ recordings = Table(
     Column("created_ns", BigInteger, nullable=False),
     Column("finished_ns", BigInteger, nullable=True),
     Column("began_ns", BigInteger, nullable=True),  # as its sender has said, for times that count from 0
+    Column("kept_since_ns", BigInteger, nullable=True),  # by the clock of retention; null: created_ns
 )
 
 windows = Table(  # PostgreSQL keeps a partition a month (`service.store.partitions`): the key holds the time

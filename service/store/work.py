@@ -30,6 +30,7 @@ class RecordingRow:
     created_ns: int
     finished_ns: int | None
     began_ns: int | None = None  # as its sender has said, for times that count from 0
+    kept_since_ns: int | None = None  # by the clock of retention, which ignores leaps of the host's
 
 
 @dataclass(frozen=True, slots=True)

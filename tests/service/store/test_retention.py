@@ -74,6 +74,34 @@ def test_what_comes_while_the_clock_is_set_back_is_not_old_when_it_is_right_agai
     assert housekeeping.once(housekeeping.clock.now()).windows == 20
 
 
+def test_uploads_that_come_while_the_clock_is_set_back_are_not_old_when_it_is_right_again(core: Core) -> None:
+    """Neither do they go first when room is needed."""
+    clocks = Clocks(START + 400 * DAY)
+    vars(core.housekeeping.clock).update(_wall=lambda: clocks.wall, _monotonic=lambda: clocks.monotonic)
+    for name, leap in (("before.csv", -300 * DAY), ("meanwhile.csv", 300 * DAY), ("after.csv", 0)):
+        row = work.RecordingRow(name, None, "n", "upload", name, 100, None, clocks.wall, None)
+        job = core.jobs.submit("recording", row)
+        with core.store.write() as connection:
+            work.update_job(connection, job.id, 1, state="done")
+        clocks.passed(3600, leap=leap)
+    assert core.housekeeping.once(core.housekeeping.clock.now()).upload_files == ()
+    with core.store.write() as connection:
+        found = retention.forget(connection, retention.RetentionLimits(0, 0, 0, upload_bytes=250))
+    assert found.upload_files == ("before.csv",)
+    clocks.passed(core.settings.retention_uploads_days * 86_400 - 7200)
+    assert core.housekeeping.once(core.housekeeping.clock.now()).upload_files == ()
+    clocks.passed(3600)
+    assert core.housekeeping.once(core.housekeeping.clock.now()).upload_files == ("meanwhile.csv",)
+
+
+def test_signals_of_an_alarm_that_was_raised_while_the_clock_was_set_back_are_kept(core: Core) -> None:
+    clocks = Clocks(START + 400 * DAY)
+    vars(core.housekeeping.clock).update(_wall=lambda: clocks.wall, _monotonic=lambda: clocks.monotonic)
+    assert core.alarm_signals._aging() == clocks.wall
+    clocks.passed(3600, leap=-300 * DAY)
+    assert core.alarm_signals._aging() == START + 400 * DAY + HOUR
+
+
 def test_the_service_stores_windows_by_the_clock_of_retention(core: Core, system: System) -> None:
     clocks = Clocks(START + 5 * DAY)
     vars(core.housekeeping.clock).update(_wall=lambda: clocks.wall, _monotonic=lambda: clocks.monotonic)
