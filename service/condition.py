@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.model.text import first_line
+from sprung.service.retrying import message_of
 from sprung.service.settings import Settings
 from sprung.service.store import Store
 from sprung.service.store.engine import LITTLE_BYTES
@@ -46,7 +46,7 @@ class Condition:
         try:
             self._store.probe()
         except (SQLAlchemyError, OSError, TimeoutError) as error:
-            return f"the store cannot be written: {first_line(error)}"
+            return f"the store cannot be written: {message_of(error)}"
         return ""
 
     def _file_troubles(self) -> list[str]:
@@ -60,10 +60,17 @@ class Condition:
         except OSError as error:
             return [f"{folder}: {error.strerror or error}"]
         found = _room_trouble(folder, free, self._settings.min_free_bytes)
+        return found + self._store_room_trouble(folder)
+
+    def _store_room_trouble(self, folder: Path) -> list[str]:
+        """Of a store on another disk than the data folder's."""
         place = self._store.folder
-        if place is not None and place.stat().st_dev != folder.stat().st_dev:
-            found += _room_trouble(place, free_bytes(place), LITTLE_BYTES)
-        return found
+        try:
+            if place is None or place.stat().st_dev == folder.stat().st_dev:
+                return []
+            return _room_trouble(place, free_bytes(place), LITTLE_BYTES)
+        except OSError as error:  # it is gone, or may not be entered any more
+            return [f"{place}: {error.strerror or error}"]
 
 
 def _room_trouble(folder: Path, free: int, needed: int) -> list[str]:

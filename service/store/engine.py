@@ -6,6 +6,7 @@ reads a vehicle's tracker to write it holds the vehicle's row (`fleet.hold_vehic
 
 from __future__ import annotations
 
+import errno
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -33,11 +34,45 @@ STATEMENT_MILLISECONDS = 60_000  # a statement that takes longer is given up: it
 UPSERT_DIALECTS = ("sqlite", "postgresql")
 
 
+class StoreFile:
+    """The file of an SQLite store, which may be deleted, moved or replaced while it is open.
+
+    SQLite would go on with the one that it has opened, and what is written there is gone with the process; and begin a
+    new one for the next connection.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._opened: tuple[int, int] | None = None  # device and inode
+
+    def opened(self, _connection: Any, _record: Any) -> None:
+        """It is that one."""
+        if self._opened is None:
+            self._opened = self._now()
+
+    def check(self, *_: Any) -> None:
+        """Raises OSError where it is no longer in its place."""
+        if self._opened is not None and self._now() != self._opened:
+            told = f"{self._path} is gone, or another file is in its place; put it back, or start the service again"
+            raise OSError(errno.EIO, told)
+
+    def _now(self) -> tuple[int, int] | None:
+        try:
+            found = self._path.stat()
+        except OSError:
+            return None
+        return found.st_dev, found.st_ino
+
+
 class Store:
     """Transactions on one database.  Safe to share between threads."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
+        self._file = None if self.folder is None else StoreFile(Path(engine.url.database or "").expanduser())
+        if self._file is not None:
+            event.listen(engine, "do_connect", self._file.check)
+            event.listen(engine, "connect", self._file.opened)
         event.listen(engine, "handle_error", _name_store)
         self.many_writers = engine.dialect.name == "postgresql"
         # one writer a process where the database has one anyway: waiting is fair here
@@ -63,17 +98,21 @@ class Store:
     def write(self) -> Iterator[Connection]:
         """One transaction, committed at the end, rolled back when anything raises.
 
-        Raises SQLAlchemyError where its turn does not come, or the database does not take it.
+        Raises SQLAlchemyError where its turn does not come, or the database does not take it; OSError where its file
+        is not in its place.
         """
         asked = time.perf_counter()
         with self.write_lock.held(), self.engine.connect() as connection:
+            self._check_file()
             connection.execution_options(sprung_write=True)
             with connection.begin():
                 self.on_wait(time.perf_counter() - asked)
                 yield connection
+            self._check_file()  # nothing is acknowledged that was written to one that is gone
 
     def probe(self) -> None:
-        """Raises SQLAlchemyError when nothing can be written now; changes nothing."""
+        """Raises SQLAlchemyError, or OSError, when nothing can be written now; changes nothing."""
+        self._check_file()
         with self.write_lock.held(PROBE_SECONDS), self.engine.connect() as connection:
             sqlite_store = connection.dialect.name == "sqlite"
             if sqlite_store:
@@ -87,6 +126,10 @@ class Store:
             finally:
                 if sqlite_store:
                     connection.exec_driver_sql(f"PRAGMA busy_timeout = {BUSY_MILLISECONDS}")
+
+    def _check_file(self) -> None:
+        if self._file is not None:
+            self._file.check()
 
     def close(self) -> None:
         """Close every connection; SQLite then folds its write-ahead log into the file."""

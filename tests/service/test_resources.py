@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import shutil
 import sqlite3
 import threading
 from pathlib import Path
@@ -18,6 +19,7 @@ from sprung.service.core import Core, build_core
 from sprung.service.monitoring.engine import Engine
 from sprung.service.processes.forked import ProcessStatus
 from sprung.service.settings import Settings
+from sprung.service.store import fleet
 
 
 @pytest.fixture
@@ -37,6 +39,41 @@ def test_a_store_that_another_process_locks_is_not_ready_and_comes_back(client: 
     other.execute("ROLLBACK")
     other.close()
     assert client.get("/health/ready").status_code == 200
+
+
+@pytest.mark.parametrize("how", ["folder moved", "file deleted", "another file"])
+def test_a_store_that_is_no_longer_in_its_place_is_not_ready_and_acknowledges_nothing(
+    engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """SQLite goes on with the file that it has opened; what is written there would be gone with the process."""
+    monkeypatch.setattr("sprung.service.condition.FRESH_SECONDS", 0.0)
+    place, away = tmp_path / "stores", tmp_path / "away"
+    url = f"sqlite:///{place}/sprung.db"
+    core = build_core(Settings(data_dir=tmp_path / "data", store=url, min_free_bytes=0), engine)
+    note = {"text": "a note", "time": "2026-09-21T14:13:20Z"}
+    with core.store.write() as connection:
+        fleet.ensure_vehicle(connection, "a", 1)
+    with TestClient(create_app(core), raise_server_exceptions=False) as client:
+        assert client.post("/vehicles/a/notes", json=note).status_code == 201
+        if how == "folder moved":
+            place.rename(away)
+        elif how == "file deleted":
+            (place / "sprung.db").unlink()
+        else:
+            shutil.copy(place / "sprung.db", place / "copy.db")
+            (place / "copy.db").replace(place / "sprung.db")
+        refused = client.post("/vehicles/a/notes", json=note)
+        assert refused.status_code == 503 and "Retry-After" in refused.headers
+        ready = client.get("/health/ready")
+        assert ready.status_code == 503 and "sprung.db is gone, or another file is in" in ready.json()["detail"]
+        assert client.get("/health/live").status_code == 200
+        core.store.close()  # of connections that are opened now none begins another store
+        assert client.get("/vehicles").status_code == 503
+        if how == "folder moved":
+            assert not place.exists()
+            away.rename(place)
+            assert client.get("/health/ready").status_code == 200
+            assert client.post("/vehicles/a/notes", json=note).status_code == 201
 
 
 def test_a_disk_that_fills_is_not_ready(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
