@@ -12,6 +12,7 @@ import typer
 
 from sprung.model.text import one_line
 from sprung.service.processes.imports import python_can_alone
+from sprung.service.processes.memory import is_shortage
 
 USAGE = 2
 INTERRUPTED = 130
@@ -70,10 +71,10 @@ def describe(error: Exception) -> str:
         context = getattr(error, "ctx", None)
         command = getattr(context, "command_path", None) or "sprung"
         return f"{one_line(usage()).rstrip('.')}; see {command} --help"
+    if is_shortage(error):
+        return one_line(f"out of memory{f': {error}' if str(error) else ''}")
     if isinstance(error, OSError) and error.strerror:
         return one_line(f"{error.filename}: {error.strerror}" if error.filename else error.strerror)
-    if isinstance(error, MemoryError):
-        return one_line(f"out of memory{f': {error}' if str(error) else ''}")
     if isinstance(error, ValueError):  # what every folder raises for input that cannot be used
         return one_line(str(error))
     if type(error).__name__ == "OperationalError":  # of SQLAlchemy: read-only, full, locked for long, out of reach

@@ -12,6 +12,7 @@ from sprung.service.cli import fleet_commands, store_commands
 from sprung.service.cli.help_text import PlainTyper
 from sprung.service.cli.options import Dbc, Json, Start, StoreUrl, System, Weights, finite_speed, vehicle_name
 from sprung.service.processes.imports import lasting_imports
+from sprung.service.processes.memory import check_address_space
 from sprung.service.processes.threads import hand_over_often, one_thread_each
 
 app = PlainTyper(
@@ -129,6 +130,7 @@ def serve(
 
     On an embedded store unless --store says otherwise.
     """
+    check_address_space()
     one_thread_each()
     with lasting_imports():
         from sprung.service.cli.serve import run

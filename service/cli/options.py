@@ -44,9 +44,11 @@ def vehicle_name(name: str | None) -> str | None:
 
     Errors: `UserError`.
     """
+    if name is None:
+        return None
     from sprung.service.sources.feed import vehicle_of
 
-    if name is not None and name != (fit := vehicle_of(name, None, "vehicle")):
+    if name != (fit := vehicle_of(name, None, "vehicle")):
         raise UserError(f"--vehicle {name!r}: letters, digits and . _ : - only, at most 128; {fit!r} would do")
     return name
 

@@ -10,7 +10,7 @@ from functools import partial
 from sprung.service.monitoring.engine import Engine
 from sprung.service.monitoring.following import Following, FollowingApart, follow
 from sprung.service.monitoring.identifier_processes import IdentifierApart, identifying_processes, placed_in
-from sprung.service.processes.forked import ForkedFunctions, forks
+from sprung.service.processes.forked import ForkedFunctions, Watch, forks
 from sprung.service.settings import Settings
 
 
@@ -34,7 +34,7 @@ def numerics(engine: Engine, settings: Settings) -> Iterator[Numerics]:
     if not (settings.apart and forks()):
         yield Numerics(engine)
         return
-    with ExitStack() as stack:
+    with ExitStack() as last, ExitStack() as stack:
         following = FollowingApart(engine, settings.vehicles_in_memory)
         stack.callback(following.forked.close)
         shared, own = identifying_processes(engine.identifier, engine.system)
@@ -42,6 +42,5 @@ def numerics(engine: Engine, settings: Settings) -> Iterator[Numerics]:
         stack.callback(own.close)
         identifier = IdentifierApart(engine.identifier, partial(shared.call, "ask"))
         processes = (following.forked, shared, own)
-        for process in processes:
-            process.watch()
+        last.callback(Watch(processes).close)
         yield Numerics(replace(engine, identifier=identifier, place=placed_in(own)), following, processes)

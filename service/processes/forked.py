@@ -127,24 +127,27 @@ class ForkedFunctions:
         asked.close()
         answer.close()
         self._there: _OtherProcess | None = _OtherProcess(process, ask, answers, time.monotonic())
-        self._watching: threading.Thread | None = None
+        self._pause = PAUSES[0] / 2  # s, before it was started last
+        self._due = 0.0  # monotonic s, from when on another one may be started
+        self._looked = _Looked()
         atexit.register(self.close)  # before multiprocessing's own, which would wait for it
 
     @property
     def pid(self) -> int | None:
         """Of the process; None while there is none."""
-        there = self._there
-        return None if there is None else there.process.pid
+        process = self.process
+        return None if process is None else process.pid
 
     @property
     def status(self) -> ProcessStatus:
         """How it is now."""
         return ProcessStatus(self._name, self._there is not None, self._restarts)
 
-    def watch(self) -> None:
-        """From now on replace the process when it ends, or does nothing any more; call it after the last fork."""
-        self._watching = threading.Thread(target=self._watch, name=f"{self._process_name}-watch", daemon=True)
-        self._watching.start()
+    @property
+    def process(self) -> BaseProcess | None:
+        """None while there is none."""
+        there = self._there
+        return None if there is None else there.process
 
     @contextmanager
     def undisturbed(self) -> Iterator[int]:
@@ -216,27 +219,33 @@ class ForkedFunctions:
                 there.process.exitcode,
             )
 
-    def _watch(self) -> None:
-        """A thread that lives as long as there is a process: the kernel ends this with the thread that started it."""
-        pause, looked = PAUSES[0], _Looked()
-        while not self._closing.is_set():
-            there = self._there
-            if there is not None:
-                if connections.wait([there.process.sentinel], LOOK_SECONDS):
-                    with self._lock:
-                        self._lose(there)
-                    lasted = time.monotonic() - there.since > LASTING_SECONDS
-                    pause = PAUSES[0] if lasted else min(2 * pause, PAUSES[1])
-                elif why := looked.trouble(there.process.pid or 0, self._asked_since):
-                    log.error("the process that %s %s; it is ended", self._name, why)
-                    there.process.kill()
-                continue
-            self._closing.wait(pause)
-            try:
-                self._replace()
-            except Exception as error:  # whatever it was, of memory, of files or of its own: it is tried again
-                log.error("the process that %s cannot be started yet: %s", self._name, error)
-                pause = min(2 * pause, PAUSES[1])
+    def look(self) -> None:
+        """Replace the process if it has ended, or does nothing any more.  For one and the same thread, which lives on:
+        the kernel ends a process with the thread that started it."""
+        there = self._there
+        if there is None:
+            if time.monotonic() >= self._due:
+                self._try_to_replace()
+        elif not there.process.is_alive():
+            with self._lock:
+                self._lose(there)
+            lasted = time.monotonic() - there.since > LASTING_SECONDS
+            self._pause_longer(PAUSES[0] if lasted else 2 * self._pause)
+        elif why := self._looked.trouble(there.process.pid or 0, self._asked_since):
+            log.error("the process that %s %s; it is ended", self._name, why)
+            there.process.kill()
+
+    def _pause_longer(self, seconds: float) -> None:
+        """Before the next process."""
+        self._pause = min(seconds, PAUSES[1])
+        self._due = time.monotonic() + self._pause
+
+    def _try_to_replace(self) -> None:
+        try:
+            self._replace()
+        except Exception as error:  # whatever it was, of memory, of files or of its own: it is tried again
+            log.error("the process that %s cannot be started yet: %s", self._name, error)
+            self._pause_longer(2 * self._pause)
 
     def _replace(self) -> None:
         """Start another process and wait until it has begun.  Raises RuntimeError where it does not, or OSError."""
@@ -295,8 +304,28 @@ class ForkedFunctions:
             there, self._there = self._there, None
             if there is not None:
                 there.end(END_SECONDS)
-        if self._watching is not None:
-            self._watching.join(END_SECONDS)
+
+
+class Watch:
+    """A thread that replaces processes when they end, or do nothing any more.  Make it after the last fork."""
+
+    def __init__(self, processes: Sequence[ForkedFunctions]) -> None:
+        self._processes = processes
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sprung-watch", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Leave the processes alone; those that it has started end."""
+        self._closing.set()
+        self._thread.join(END_SECONDS)
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            there = [one for forked in self._processes if (one := forked.process) is not None]
+            connections.wait([one.sentinel for one in there], LOOK_SECONDS)
+            for forked in self._processes:
+                forked.look()
 
 
 @dataclass(slots=True)

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -292,6 +293,24 @@ def test_an_unexpected_error_is_one_line_too() -> None:
 def test_memory_that_is_not_to_be_had_is_said_in_plain_words() -> None:
     assert describe(MemoryError()) == "out of memory"
     assert describe(MemoryError("Unable to allocate 4 GiB")) == "out of memory: Unable to allocate 4 GiB"
+    assert describe(RuntimeError("can't start new thread")) == "out of memory: can't start new thread"
+    told = "libtorch_cpu.so: failed to map segment from shared object"
+    assert describe(ImportError(told)) == f"out of memory: {told}"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="address space is bounded on Linux")
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [("serve", "(`ulimit -v`) allows 512 MB of address space, and 1450 MB are needed"), ("system", "")],
+)
+def test_too_little_memory_to_start_is_told_in_one_line(tmp_path: Path, command: str, told: str) -> None:
+    script = f"ulimit -v 500000; exec {shlex.quote(sys.executable)} -m sprung {command}"
+    environment = os.environ | {"SPRUNG_DATA_DIR": str(tmp_path)}
+    done = subprocess.run(
+        ["bash", "-c", script], env=environment, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 2 and done.stderr.startswith("sprung: out of memory: ") and told in done.stderr
+    assert done.stderr.count("\n") == 1 and not done.stdout and "unexpected" not in done.stderr
 
 
 def test_help_and_version_are_exit_status_zero(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from sprung.service.monitoring.identifier_processes import IdentifierApart, iden
 from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.monitoring.processed import WindowsToFold
 from sprung.service.processes import forked
-from sprung.service.processes.forked import ForkedFunctions, ProcessEnded
+from sprung.service.processes.forked import ForkedFunctions, ProcessEnded, Watch
 from sprung.service.store import Store, open_store
 from tests.service_fakes import make_window
 
@@ -49,6 +49,17 @@ def _double(value: int) -> int:
 def _doubles(values: list[int]) -> Iterator[int]:
     for value in values:
         yield _double(value)
+
+
+@pytest.fixture
+def watch() -> Iterator[Callable[..., None]]:
+    """Begins to watch processes; for as long as a test takes."""
+    with ExitStack() as stack:
+
+        def begin(*processes: ForkedFunctions) -> None:
+            stack.enter_context(closing(Watch(processes)))
+
+        yield begin
 
 
 @pytest.fixture
@@ -134,9 +145,9 @@ def _until(there: Callable[[], bool], seconds: float = 60.0) -> None:
 
 
 def test_a_killed_process_is_replaced_without_being_asked(
-    doubling: ForkedFunctions, caplog: pytest.LogCaptureFixture
+    doubling: ForkedFunctions, watch: Callable[..., None], caplog: pytest.LogCaptureFixture
 ) -> None:
-    doubling.watch()
+    watch(doubling)
     for restarts in (1, 2):
         before = doubling.pid
         assert before is not None and doubling.status.works
@@ -150,10 +161,10 @@ def test_a_killed_process_is_replaced_without_being_asked(
 
 
 def test_a_process_that_is_stopped_is_replaced_and_who_asks_does_not_wait_for_ever(
-    doubling: ForkedFunctions, monkeypatch: pytest.MonkeyPatch
+    doubling: ForkedFunctions, watch: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(forked, "STOPPED_SECONDS", 1.0)
-    doubling.watch()
+    watch(doubling)
     assert doubling.pid is not None
     os.kill(doubling.pid, signal.SIGSTOP)
     begun = time.monotonic()
@@ -165,12 +176,12 @@ def test_a_process_that_is_stopped_is_replaced_and_who_asks_does_not_wait_for_ev
 
 
 def test_a_process_whose_threads_wait_for_each_other_is_replaced_and_one_at_work_is_not(
-    monkeypatch: pytest.MonkeyPatch,
+    watch: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(forked, "IDLE_SECONDS", 1.5)
     functions: dict[str, Callable[..., Any]] = {"wait": _for_ever, "work": _seconds_of_work}
     with closing(ForkedFunctions("waits", functions)) as waiting:
-        waiting.watch()
+        watch(waiting)
         assert waiting.call("work", 4.0) == 4.0
         with pytest.raises(ProcessEnded):
             waiting.call("wait")
@@ -191,8 +202,10 @@ def _seconds_of_work(seconds: float) -> float:
     return seconds
 
 
-def test_closing_does_not_wait_for_a_process_that_is_just_being_started(doubling: ForkedFunctions) -> None:
-    doubling.watch()
+def test_closing_does_not_wait_for_a_process_that_is_just_being_started(
+    doubling: ForkedFunctions, watch: Callable[..., None]
+) -> None:
+    watch(doubling)
     assert doubling.pid is not None
     os.kill(doubling.pid, signal.SIGKILL)
     _until(lambda: doubling.pid is None)
@@ -262,7 +275,9 @@ def test_an_identifier_apart_answers_as_it_does_here(engine: Engine, system: Sys
                 os.kill(shared.pid, signal.SIGKILL)
 
 
-def test_identifiers_that_take_the_place_of_others_come_to_the_same(engine: Engine, system: System) -> None:
+def test_identifiers_that_take_the_place_of_others_come_to_the_same(
+    engine: Engine, system: System, watch: Callable[..., None]
+) -> None:
     shared, own = identifying_processes(engine.identifier, system)
     values = np.stack([make_window(system, n).values for n in range(3)])
     with closing(shared), closing(own):
@@ -271,7 +286,7 @@ def test_identifiers_that_take_the_place_of_others_come_to_the_same(engine: Engi
         for process in (shared, own):
             assert process.pid is not None
             os.kill(process.pid, signal.SIGKILL)
-            process.watch()
+        watch(shared, own)
         _until(lambda: shared.status.works and shared.status.restarts == own.status.restarts == 1)
         assert own.pid is not None and shared.pid is not None
         assert os.getpriority(os.PRIO_PROCESS, own.pid) > os.getpriority(os.PRIO_PROCESS, shared.pid)
@@ -305,7 +320,7 @@ def test_a_vehicles_own_model_is_identified_apart_and_behind_the_others(engine: 
 
 @pytest.mark.parametrize(("vehicles", "watched"), [(1, False), (10, False), (10, True)])
 def test_trackers_apart_come_to_the_same(
-    engine: Engine, system: System, tmp_path: Path, vehicles: int, watched: bool
+    engine: Engine, system: System, tmp_path: Path, watch: Callable[..., None], vehicles: int, watched: bool
 ) -> None:
     """With room for one vehicle in the process, and for all; it is killed on the way, and replaced where it is watched:
     the other one knows no vehicle."""
@@ -322,7 +337,7 @@ def test_trackers_apart_come_to_the_same(
             if part == 2 and following is not None and following.forked.pid is not None:
                 os.kill(following.forked.pid, signal.SIGKILL)
                 if watched:
-                    following.forked.watch()
+                    watch(following.forked)
                     _until(lambda process=following.forked: process.status.restarts == 1)  # type: ignore[misc]
         states[name] = [pipeline.state(vehicle).to_dict() for vehicle in ("a", "b")]
         if following is not None:
