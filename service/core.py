@@ -109,6 +109,11 @@ class Core:
         gc.collect()
         gc.freeze()
 
+    def stop(self) -> None:
+        """Begin to: nothing new is accepted; requests that wait for the store are answered before they are cut off."""
+        self.store.leave_within(0.75 * self.settings.shutdown_seconds)
+        self.stopping.set()
+
     def close(self) -> None:
         """Finish what was accepted, then let go of the store."""
         self.stopping.set()

@@ -82,7 +82,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
                 feed.start()
 
         def stop() -> None:
-            core.stopping.set()
+            core.stop()
             files.join(settings.shutdown_seconds)
             for feed in core.feeds:
                 feed.join(settings.shutdown_seconds)
@@ -93,7 +93,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         if notice:
             announce_access(notice)
         try:
-            server = make_server(create_app(core, start, stop), settings, core.stopping.set)
+            server = make_server(create_app(core, start, stop), settings, core.stop)
         except (OSError, ssl.SSLError) as error:
             raise UserError(f"TLS: {settings.tls_certificate}: {error.strerror or error}") from error
         door = server.doorkeeper

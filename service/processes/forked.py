@@ -244,6 +244,8 @@ class ForkedFunctions:
         try:
             self._replace()
         except Exception as error:  # whatever it was, of memory, of files or of its own: it is tried again
+            if self._closing.is_set():
+                return
             log.error("the process that %s cannot be started yet: %s", self._name, error)
             self._pause_longer(2 * self._pause)
 

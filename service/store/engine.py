@@ -7,6 +7,7 @@ reads a vehicle's tracker to write it holds the vehicle's row (`fleet.hold_vehic
 from __future__ import annotations
 
 import errno
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,10 +24,11 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
 
 from sprung.model.text import first_line
 from sprung.service.errors import UserError
-from sprung.service.store.write_lock import WriteLock
+from sprung.service.store.write_lock import LONGEST_WAIT, WriteLock
 
 BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
 PROBE_SECONDS = 2.0
+LAST_SECONDS = 0.2  # for which a transaction waits where the process should have ended
 KEPT_READERS, MOST_READERS = 8, 32  # connections to SQLite that stay open; more while as many requests read at once
 MOST_WRITERS = 10  # transactions of one process at once on PostgreSQL; others wait
 LITTLE_BYTES = 4_000_000  # free on a disk: SQLite's write-ahead log grows to this
@@ -77,6 +79,7 @@ class Store:
         self.many_writers = engine.dialect.name == "postgresql"
         # one writer a process where the database has one anyway: waiting is fair here
         self.write_lock = WriteLock(MOST_WRITERS if self.many_writers else 1)
+        self._leave = math.inf  # monotonic s, by when nothing waits to write any more
         self.on_wait: Callable[[float], None] = lambda seconds: None  # takes each transaction's wait to write
         self.months: set[str] = set()  # partitions that are known to be there (`partitions.prepare`)
 
@@ -102,8 +105,10 @@ class Store:
         is not in its place.
         """
         asked = time.perf_counter()
-        with self.write_lock.held(), self.engine.connect() as connection:
+        with self.write_lock.held(self._patience(LONGEST_WAIT)), self.engine.connect() as connection:
             self._check_file()
+            if self._leave < math.inf:
+                self._wait_for_others(connection, self._patience(BUSY_MILLISECONDS / 1000))
             connection.execution_options(sprung_write=True)
             with connection.begin():
                 self.on_wait(time.perf_counter() - asked)
@@ -114,18 +119,28 @@ class Store:
         """Raises SQLAlchemyError, or OSError, when nothing can be written now; changes nothing."""
         self._check_file()
         with self.write_lock.held(PROBE_SECONDS), self.engine.connect() as connection:
-            sqlite_store = connection.dialect.name == "sqlite"
-            if sqlite_store:
-                connection.exec_driver_sql(f"PRAGMA busy_timeout = {round(1000 * PROBE_SECONDS)}")
-                connection.rollback()
+            self._wait_for_others(connection, PROBE_SECONDS)
             try:
                 connection.execution_options(sprung_write=True)
                 with connection.begin() as transaction:
                     connection.execute(text("SELECT 1"))
                     transaction.rollback()
             finally:
-                if sqlite_store:
-                    connection.exec_driver_sql(f"PRAGMA busy_timeout = {BUSY_MILLISECONDS}")
+                self._wait_for_others(connection, BUSY_MILLISECONDS / 1000)
+
+    def leave_within(self, seconds: float) -> None:
+        """The process ends: where another one holds the database, what is still to be written does not wait longer."""
+        self._leave = min(self._leave, time.monotonic() + seconds)
+
+    def _patience(self, seconds: float) -> float:
+        """The seconds for which to wait, or as many as are left."""
+        return min(seconds, max(LAST_SECONDS, self._leave - time.monotonic()))
+
+    def _wait_for_others(self, connection: Connection, seconds: float) -> None:
+        """How long other processes' transactions are waited for."""
+        if connection.dialect.name == "sqlite":
+            connection.exec_driver_sql(f"PRAGMA busy_timeout = {round(1000 * seconds)}")
+            connection.rollback()
 
     def _check_file(self) -> None:
         if self._file is not None:

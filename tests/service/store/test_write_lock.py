@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
-from contextlib import ExitStack
+import time
+from contextlib import ExitStack, closing
+from pathlib import Path
 
 import pytest
 from sqlalchemy.exc import SQLAlchemyError
 
+from sprung.service.core import build_core
+from sprung.service.monitoring.engine import Engine
+from sprung.service.settings import Settings
+from sprung.service.store import open_store
 from sprung.service.store import write_lock as module
 from sprung.service.store.write_lock import WriteLock
 from tests.service_fakes import eventually
@@ -54,3 +61,28 @@ def test_a_turn_that_does_not_come_in_time_is_none(monkeypatch: pytest.MonkeyPat
         raise ZeroDivisionError
     with lock.held(0.0):
         pass
+
+
+def test_a_process_that_ends_does_not_wait_for_a_store_that_another_one_holds(tmp_path: Path) -> None:
+    """Each of those who still write would wait for the other's lock in turn."""
+    path = tmp_path / "sprung.db"
+    store = open_store(f"sqlite:///{path}")
+    with closing(sqlite3.connect(path, isolation_level=None)) as other, closing(store):
+        other.execute("BEGIN IMMEDIATE")
+        begun = time.monotonic()
+        store.leave_within(0.5)
+        store.leave_within(60.0)  # said twice, it is not put off
+        for _ in range(4):
+            with pytest.raises(SQLAlchemyError, match="locked"), store.write():
+                pass
+        assert time.monotonic() - begun < 5.0
+        other.execute("ROLLBACK")
+        with store.write():
+            pass
+
+
+def test_the_service_says_so_to_its_store_when_it_is_told_to_end(engine: Engine, data_dir: Path) -> None:
+    core = build_core(Settings(data_dir=data_dir, shutdown_seconds=1), engine)
+    core.stop()
+    assert core.stopping.is_set() and core.store._patience(60.0) <= 0.75
+    core.store.close()
