@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -23,6 +24,8 @@ def misbehave(how: str, emit: Emit[int]) -> str:
     emit(os.getpid())
     if how == "refuse":
         raise ValueError("line 3 is\nno number")
+    if how == "full":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/var/lib/sprung/reports/x.part/page.html")
     if how == "break":
         raise KeyError("a mistake of ours")
     if how == "crash":

@@ -7,6 +7,7 @@ process is ended with its parent, however that ends, and can be ended at any mom
 from __future__ import annotations
 
 import ctypes
+import errno
 import logging
 import multiprocessing
 import os
@@ -38,6 +39,7 @@ POLL_SECONDS = 0.1
 START_SECONDS = 600.0  # to import what a task needs: seconds of work, minutes where the machine has no time
 END_SECONDS = 5.0  # a process that was killed is gone long before
 PR_SET_PDEATHSIG = 1
+SHORTAGES = (errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE)  # of the machine, for a while
 FROM_OUTSIDE = ("SIGKILL", "SIGTERM", "SIGHUP", "SIGQUIT")  # nothing that runs in a process sends itself these
 _starting = threading.Lock()
 
@@ -79,6 +81,14 @@ class _Done:
 @dataclass(frozen=True, slots=True)
 class _Refused:
     reason: str  # one line for the user
+
+
+@dataclass(frozen=True, slots=True)
+class _Short:
+    """Of what the machine lacks, as of room on its disk: the same may succeed later."""
+
+    number: int  # errno
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +136,8 @@ class Worker(Generic[Message, Result]):
 
         check: called ten times a second, may raise to give up; the process is then ended.
         Raises UserError for input that cannot be used, for limits that are exceeded and for a process that died, as
-        WorkerKilled where that may have come from outside; WorkerFailed for an error of the program.
+        WorkerKilled where that may have come from outside; OSError where the machine lacks something, as of room on its
+        disk; WorkerFailed for an error of the program.
         """
         try:
             while True:
@@ -140,6 +151,8 @@ class Worker(Generic[Message, Result]):
                         return
                     case _Refused(reason):
                         raise UserError(reason)
+                    case _Short(number, reason):
+                        raise OSError(number, reason)
                     case _Broken(text):
                         raise WorkerFailed(text)
         finally:
@@ -240,7 +253,10 @@ def _run(
         say(_Refused(f"it needs more memory than the {(limits.memory_bytes or 0) / 1e9:.1f} GB that are allowed"))
     except (ValueError, OSError) as error:  # what every folder raises for input that cannot be used
         log.debug("refused", exc_info=True)
-        say(_Refused(" ".join(str(error).split())[:500] or type(error).__name__))
+        if isinstance(error, OSError) and error.errno in SHORTAGES:
+            say(_Short(error.errno, error.strerror or os.strerror(error.errno)))
+        else:
+            say(_Refused(" ".join(str(error).split())[:500] or type(error).__name__))
     except Exception:
         say(_Broken(traceback.format_exc()))
 

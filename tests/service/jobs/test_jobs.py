@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import threading
 import time
 from dataclasses import replace
@@ -251,6 +252,28 @@ def test_a_diagnosis_that_breaks_fails_and_the_next_one_works(core: Core, name: 
         assert eventually(lambda: stored(core.store, bad).state == "failed")  # a deadly one is tried twice
         assert told in (stored(core.store, bad).error or "")
         assert [path.name for path in core.settings.reports.iterdir()] == [good]
+
+
+def finds_no_room_at_first(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
+    """A diagnosis whose report does not fit onto the disk until the third time."""
+    tries = request.out.parent / "tries"
+    tries.parent.mkdir(parents=True, exist_ok=True)
+    count = len(tries.read_text()) if tries.exists() else 0
+    tries.write_text("x" * (count + 1))
+    if count < 2:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(request.out))
+    return diagnose(request, emit)
+
+
+def test_a_diagnosis_whose_report_finds_no_room_is_made_when_there_is(
+    core: Core, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("sprung.service.retrying.FIRST_RETRY", 0.01)
+    core.diagnosis_jobs.task = finds_no_room_at_first
+    with TestClient(create_app(core)) as client:
+        job = ask_for(client, "good.mcap")
+        assert eventually(lambda: stored(core.store, job).state == "done", 60.0)
+    assert caplog.text.count("No space left on device; trying again") == 2
 
 
 def tells_its_time(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:

@@ -67,6 +67,7 @@ def test_the_program_that_starts_a_worker_is_not_run_again(tmp_path: Path) -> No
     [
         ("refuse", UserError, "line 3 is no number"),
         ("break", WorkerFailed, "a mistake of ours"),
+        ("full", OSError, "^.Errno 28. No space left on device$"),  # without the path, which is of the service's own
         ("crash", UserError, r"the process of the work was ended by SIGSEGV \(signal 11\): it crashed"),
         (
             "killed",
