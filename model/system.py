@@ -15,7 +15,7 @@ from sprung.model.digest import digest_of, structure_of
 from sprung.model.laws import CATALOGUE, ElementLaw, Law, SensorLaw
 from sprung.model.laws.in_place import Follower, MechanicsWithLaws, all_in_place, is_linear, misplaced
 from sprung.model.laws.placed import PlacedLaw, placed_laws
-from sprung.model.laws.undone import undone
+from sprung.model.laws.undone import is_modelled, undone
 from sprung.model.mechanics import Mechanics, Mode, assemble
 from sprung.model.parameters import LoadState, Parameter, Tolerance
 from sprung.model.schema import (
@@ -86,9 +86,13 @@ class System:
         """What is in place beyond the nominal structure."""
         return placed_laws(self.file, self.catalogue)[0]
 
-    def undistorted(self, values: FloatArray) -> FloatArray:
-        """Recorded channels (..., T, C) without the faults of measurements that the file states."""
-        return undone(values, [channel.name for channel in self.channels], self.laws, self.sample_rate)
+    def undistorted(self, values: FloatArray, *, filtered: bool = False) -> FloatArray:
+        """Recorded channels (..., T, C) without the faults of measurements that the file states.
+
+        filtered: sensors stay behind their filters, for who models these: to undo a high-pass filter integrates.
+        """
+        laws = [one for one in self.laws if not (filtered and is_modelled(one, self.sensors))]
+        return undone(values, [channel.name for channel in self.channels], laws, self.sample_rate)
 
     @property
     def name(self) -> str:

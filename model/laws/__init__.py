@@ -23,6 +23,8 @@ from sprung.model.laws.own import LawFileError, load_laws
 from sprung.model.laws.running_gear import ANTI_ROLL_BAR, RAIL_JOINTS, WHEEL_FLAT
 from sprung.model.laws.sensor_faults import (
     AXLE_DELAY,
+    HIGH_PASS,
+    MOUNTING_RESONANCE,
     SENSOR_BIAS,
     SENSOR_GAIN,
     SENSOR_LAG,
@@ -80,6 +82,8 @@ CATALOGUE: tuple[Law, ...] = (
     DAMPING_CHANGE,
     SENSOR_GAIN,
     SENSOR_LAG,
+    HIGH_PASS,
+    MOUNTING_RESONANCE,
     SENSOR_BIAS,
     SENSOR_NOISE,
     SENSOR_STUCK,

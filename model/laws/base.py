@@ -136,6 +136,11 @@ class Parametrised:
         return False
 
     @property
+    def filters(self) -> bool:
+        """Whether it is a filter of a channel, with a memory of its own."""
+        return False
+
+    @property
     def frequency(self) -> int | None:
         """The parameter that is its own frequency, Hz."""
         return next((i for i, spec in enumerate(self.parameters) if spec.unit == "Hz"), None)

@@ -162,6 +162,10 @@ class SensorLaw(Parametrised):
     response: Callable[[Values], SensorResponse] | None = None  # None: not a function of the truth (noise, stuck)
     at: tuple[Channels, ...] = ()  # which channels are screened for it
     scale: Callable[[float, float], float] = _as_large_as_found  # of a step's length (s) and the amplitude found
+    # Of a filter: values with which it is sought, (trials, P), from the lowest and the highest frequency that shows, Hz
+    trials: Callable[[float, float], FloatArray] | None = None
+    shared: bool = False  # whether instruments of a kind usually have the same one, and it is sought for all of them
+    kinds: tuple[str, ...] = ()  # of sensors that may have it; empty: all
     forms: Mapping[str, SensorLaw] = field(default_factory=dict)  # other models of the same effect, by variant
     where: Where = "sensor"  # "axle": all inputs of one axle together
     stuck: bool = False  # the channel repeats its first value
@@ -176,9 +180,13 @@ class SensorLaw(Parametrised):
         return True
 
     @property
+    def filters(self) -> bool:
+        return self.trials is not None
+
+    @property
     def delays(self) -> bool:
         alone = self.response is not None and len(self.parameters) == 1
-        return alone and self.slope() == SensorResponse(0.0, 0.0, 1.0, 0.0)
+        return alone and not self.filters and self.slope() == SensorResponse(0.0, 0.0, 1.0, 0.0)
 
     @property
     def discriminated_by(self) -> str:
@@ -201,11 +209,13 @@ class SensorLaw(Parametrised):
         return first * second if self.absent[0] else first + second
 
     def slope(self) -> SensorResponse:
-        """Derivative of the response by the first parameter, at none of the fault."""
+        """Derivative of the response by the first parameter, at none of the fault; no fault's where it filters."""
         if self.response is None:
             raise ValueError(f"{self.name} has no response")
+        if self.filters:
+            return super().slope()
         here, there = (self.response((self.absent[0] + step, *self.absent[1:])) for step in (0.0, 1.0))
-        return SensorResponse(*(b - a for a, b in zip(here, there, strict=True)))
+        return SensorResponse(*(getattr(there, one) - getattr(here, one) for one in ("gain", "lag", "delay", "offset")))
 
 
 Law = ElementLaw | BodyLaw | StructureLaw | SupportLaw | SensorLaw

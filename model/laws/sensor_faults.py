@@ -1,12 +1,15 @@
-"""Faults of measurements: gain, lag, bias, noise, stuck; and an axle placed at the wrong time."""
+"""Faults of measurements: gain, lag, filters, bias, noise, stuck; and an axle placed at the wrong time."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from sprung.model.laws.base import RARE, ParameterSpec
-from sprung.model.laws.channel import SensorResponse
+import numpy as np
+
+from sprung.model.laws.base import RARE, ParameterSpec, grid
+from sprung.model.laws.channel import SensorResponse, high_pass_section, resonance_section
 from sprung.model.laws.kinds import SensorLaw
+from sprung.model.signals import FloatArray
 
 OF_CHANNEL = "unit of the channel"  # of a parameter
 _SECONDS = ParameterSpec("time", "s", -1.0, 1.0, "delay of the signal; negative: early", lambda seen: 0.005)
@@ -62,6 +65,83 @@ _BOTH = replace(
     prior_cost=RARE,
 )
 SENSOR_LAG = replace(_LATE, forms={"first order": _FIRST_ORDER, "first order and delay": _BOTH})
+_CORNERS = 4  # trials per octave, of high-pass filters
+_RATIOS = (0.03, 0.1)  # damping ratios of trial resonances
+_SLOWEST = 3.0  # Hz, of an instrument on its mounting; chosen: cable ducts and sheet metal
+_BEYOND = 4.0  # times the highest frequency that shows, up to which a resonance does
+
+
+def _corners(lowest: float, highest: float) -> FloatArray:
+    """Corners from what a record's length shows to a tenth of the band, where nothing of an instrument is left."""
+    highest = max(lowest, 0.1 * highest)
+    return grid(np.geomspace(lowest, highest, 1 + int(np.ceil(_CORNERS * np.log2(highest / lowest)))))
+
+
+def _resonances(lowest: float, highest: float) -> FloatArray:
+    """Resonances as close as they are wide within the band; wider apart above, where only their skirt shows."""
+    least = max(lowest, _SLOWEST)
+    if least >= highest:
+        return np.zeros((0, 2))
+    within = [
+        grid(np.geomspace(least, highest, 2 + int(np.log(highest / least) / (2 * ratio))), [ratio]) for ratio in _RATIOS
+    ]
+    beyond = grid(np.geomspace(highest, _BEYOND * highest, 10)[1:], _RATIOS[:1])
+    return np.concatenate([*within, beyond])
+
+
+_HIGH_PASS = SensorLaw(
+    name="high_pass",
+    title="high-pass filter",
+    parameters=(
+        ParameterSpec("corner", "Hz", 1e-4, 1e3, "frequency below which little passes (-3 dB)", lambda seen: 0.1),
+    ),
+    absent=(0.0,),
+    looks_like="slow motion is missing in a channel, or in all of a kind, and what is left of it comes early",
+    confused_with=("sensor_lag", "suspended_mass", "air_spring", "mass_change"),
+    sentence="shows little below {corner}, as behind a high-pass filter of first order",
+    response=lambda p: SensorResponse(sections=high_pass_section(p[0])),
+    at=("sensor",),
+    trials=_corners,
+    shared=True,
+    kinds=("acceleration", "velocity"),
+)
+_SECOND_ORDER = replace(
+    _HIGH_PASS,
+    parameters=(
+        *_HIGH_PASS.parameters,
+        ParameterSpec("damping_ratio", "1", 0.1, 10.0, "of its two poles; above 1: two corners", lambda seen: 0.7),
+    ),
+    absent=(0.0, float(np.sqrt(0.5))),
+    sentence="shows little below {corner}, as behind a high-pass filter of second order with a damping ratio of "
+    "{damping_ratio}",
+    response=lambda p: SensorResponse(sections=high_pass_section(p[0], p[1])),
+    trials=lambda lowest, highest: grid(_corners(lowest, highest)[:, 0], [np.sqrt(0.5)]),
+    prior_cost=RARE,
+)
+HIGH_PASS = replace(_HIGH_PASS, forms={"second order": _SECOND_ORDER})
+_RESONANT = SensorLaw(
+    name="mounting_resonance",
+    title="resonance of the instrument on its mounting",
+    parameters=(
+        ParameterSpec("frequency", "Hz", 1.0, 1e5, "natural frequency", lambda seen: 30.0),
+        ParameterSpec("damping_ratio", "1", 1e-3, 0.7, "of critical damping", lambda seen: 0.03),
+    ),
+    absent=(float("inf"), 0.0),
+    looks_like="one channel is amplified around a frequency, or ever more towards the end of the band, and no other",
+    confused_with=("suspended_mass", "flexible_mode", "sensor_gain", "sensor_lag"),
+    sentence="resonates on its mounting at {frequency} with {damping_ratio} of critical damping",
+    response=lambda p: SensorResponse(sections=resonance_section(p[0], p[1])),
+    at=("sensor",),
+    trials=_resonances,
+    shared=True,
+    kinds=("acceleration", "velocity"),
+)
+_ON_BRACKET = replace(
+    _RESONANT,
+    sentence="resonates on its bracket at {frequency} with {damping_ratio} of critical damping",
+    response=lambda p: SensorResponse(sections=resonance_section(p[0], p[1], of_base=True)),
+)
+MOUNTING_RESONANCE = replace(_RESONANT, forms={"bracket": _ON_BRACKET})
 SENSOR_BIAS = SensorLaw(
     name="sensor_bias",
     title="offset",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from sprung.model.laws.kinds import SensorLaw
 from sprung.model.laws.placed import PlacedLaw
@@ -24,3 +24,8 @@ def undone(values: FloatArray, channels: Sequence[str], laws: Sequence[PlacedLaw
                 result = result.copy() if result is values else result
                 result[..., column] = law.restore(result[..., column], placed.values, sample_rate)
     return result
+
+
+def is_modelled(placed: PlacedLaw, sensors: Collection[str]) -> bool:
+    """Whether a law is a filter of a sensor, which a model of the whole recording contains, with what it remembers."""
+    return placed.law.filters and placed.location in sensors

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping, MutableMapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,11 @@ def _write_parameters(file: Any, parameters: Iterable[ReportedParameter]) -> Non
 
 def _write_laws(file: Any, system: System, report: Report) -> None:
     """The laws of a report in place of those that the file has; which values it holds fixed stay so."""
-    undone = {law.name for law in system.catalogue if isinstance(law, SensorLaw)}
+    faults = {law.name: law for law in system.catalogue if isinstance(law, SensorLaw)}
+    undone = {name for name, law in faults.items() if not law.filters}
     for group in _GROUPS:
         for entry in (file.get(group) or {}).values():
-            _drop_laws(entry, undone)
+            _drop_laws(entry, undone if group == "sensors" else set(faults))
     held = {name for law in system.laws for name, fixed in zip(law.names, law.fixed, strict=True) if fixed}
     for law in report.laws:
         _place(file, system, law, held)
@@ -104,7 +106,7 @@ def _set_value(entry: Any, quantity: str, value: float) -> None:
 
 
 def _drop_laws(entry: Any, undone: set[str]) -> None:
-    """Take out laws, whose values come anew; faults of measurements stay: they were undone before."""
+    """Take out laws, whose values come anew; those that were undone before stay."""
     if not isinstance(entry, MutableMapping):
         return
     if "laws" in entry:
@@ -116,12 +118,16 @@ def _drop_laws(entry: Any, undone: set[str]) -> None:
 
 def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> None:
     """Add a law; held: full names of values that the file holds fixed."""
+    known = next((one for one in system.catalogue if one.name == law.effect), None)
+    if known is not None and known.where == "sensor" and "|" in law.location:  # one filter of several sensors
+        for place in law.location.split("|"):
+            _place(file, system, replace(law, location=place), held)
+        return
     first, *others = law.location.split("|")
     entry = _holder(file, first)
     if entry is None:
         return
     setting = CommentedMap({name: text for name in ("formula", "memory") if (text := getattr(law, name))})
-    known = next((one for one in system.catalogue if one.name == law.effect), None)
     setting.update(_law_values(known, law, held))
     if law.variant and law.variant != WIDER:
         setting["variant"] = law.variant

@@ -297,9 +297,8 @@ def _difference(
     moved = term.moved(parameter, step)
     terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
     elsewhere = replace(point, terms=terms, warm_start=warm_start_of(forces))
-    if term.location in problem.system.sensors and isinstance(
-        term.law, SensorLaw
-    ):  # sensor faults have no effect on the motion
+    of_sensors = isinstance(term.law, SensorLaw) and set(term.places) <= set(problem.system.sensors)
+    if of_sensors:  # faults of sensors have no effect on the motion
         other_forward, other_forces = problem.forward(elsewhere, working.inputs, forward.plant), forces
         other = problem.shown(other_forward, forces)
     else:

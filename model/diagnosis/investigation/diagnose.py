@@ -197,7 +197,9 @@ def begun(
     """
     progress(0.02, "channels and noise")
     options = replace(options, work=options.work or WorkBudget(options.rules.fit.work))
-    prepared = prepare(system, system.undistorted(record.values), record.sample_rate, options.rules.record)
+    prepared = prepare(
+        system, system.undistorted(record.values, filtered=True), record.sample_rate, options.rules.record
+    )
     signals, split = cut(prepared.signals, options.rules.record)
     declared = declared_noise(system, signals, options.rules)
     progress(0.05, "nominal structure identified again; screening all laws at all places")

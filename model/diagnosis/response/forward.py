@@ -5,6 +5,7 @@ The linear part is mapped bin by bin, the forces of laws along the trajectory ar
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb
@@ -14,13 +15,14 @@ from scipy.fft import irfft
 from scipy.linalg import expm
 
 from sprung.model.diagnosis.record.signals import Part
-from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray, detrend_ends
+from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray, derivative, detrend_ends
 from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.newton import PATIENCE, newton_step
 from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branches_of, evaluated_in_time, supports
 from sprung.model.laws import CLOCK_LEAD, SensorLaw, SensorResponse, SpringDamper, SupportLaw
+from sprung.model.laws.channel import FilterSection
 from sprung.model.laws.in_place import with_law
 from sprung.model.mechanics import VELOCITY, Mechanics
 from sprung.model.ratios import mechanics_at
@@ -68,8 +70,8 @@ class Forward:
         branches = tuple(branch for term in self.terms for branch in branches_of(term, self.system, structure))
         structure = replace(structure, stiffness=stiffness, damping=damping, branches=branches)
         if self.known is not None and self.known.grid == self.part.grid and self.known.structure.same(structure):
-            return self.known
-        return Plant(structure, self.part.grid)
+            return self.known if self.known.structure.filters == self.filters else self.known.behind(self.filters)
+        return Plant(replace(structure, filters=self.filters), self.part.grid)
 
     def element_of(self, term: Term) -> SpringDamper:
         """Spring and damper of the element a term acts at, with the parameters of this model."""
@@ -217,6 +219,8 @@ class Forward:
         grid = self.part.grid
         gain, lag, delay, offset = self.faults
         late = _lagged(_later(polynomial, delay / grid.length), lag / grid.length)
+        for i, section in self.filters:
+            late[:, i] = _filtered(late[:, i], section, grid.length)
         shown = periodic * self.sensor_factor + grid.monomial_spectra @ (late * gain)
         shown[0] += offset * np.sqrt(grid.samples)
         return shown
@@ -224,18 +228,27 @@ class Forward:
     @cached_property
     def faults(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Gain, time constant of a lag (s), pure delay (s) and offset of every present sensor, each (S,)."""
-        gain, lag, delay, offset = (np.full(len(self.sensors), value) for value in SensorResponse())
-        names = [self.system.sensors[i] for i in self.sensors]
-        for term in self.terms:
-            response = response_of(term)
-            if response is None or term.location not in names:
-                continue
-            i = names.index(term.location)
+        gain, lag, delay, offset = (np.full(len(self.sensors), value) for value in SensorResponse()[:4])
+        for i, response in self._responses:
             gain[i] *= response.gain
             lag[i] += response.lag
             delay[i] += response.delay
             offset[i] += response.offset
         return gain, lag, delay, offset
+
+    @property
+    def _responses(self) -> Iterator[tuple[int, SensorResponse]]:
+        """Responses of faulty sensors, by their index among those present."""
+        names = [self.system.sensors[i] for i in self.sensors]
+        for term in self.terms:
+            response = response_of(term)
+            if response is not None:
+                yield from ((names.index(place), response) for place in term.places if place in names)
+
+    @cached_property
+    def filters(self) -> tuple[tuple[int, FilterSection], ...]:
+        """Filters of the present sensors, by their index."""
+        return tuple((i, section) for i, response in self._responses for section in response.sections)
 
     @cached_property
     def sensor_factor(self) -> ComplexArray:
@@ -243,6 +256,8 @@ class Forward:
         gain, lag, delay, _ = self.faults
         s = 1j * self.part.grid.omega[:, None]
         found: ComplexArray = gain * np.exp(-s * delay) / (1 + s * lag)
+        for i, section in self.filters:
+            found[:, i] *= section.at(s[:, 0])
         return found
 
     def of_body_loads(self) -> ComplexArray | float:
@@ -282,6 +297,12 @@ class Forward:
         A = self.plant.structure.state_matrix()
         for i in np.flatnonzero((lag != 0) | (delay != 0)):
             rows[i] = rows[i] @ expm(-A * delay[i]) @ np.linalg.inv(np.eye(len(A)) + A * lag[i])
+        at = self.plant.structure.moving
+        moving = slice(at)
+        for sensor, section in self.filters:
+            rows[sensor, moving] = section.of_matrix(rows[sensor, moving], A[moving, moving])
+            rows[sensor, at] = 1.0
+            at += section.order
         return rows * gain[:, None]
 
     def fine_motion(self, ports: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -353,6 +374,15 @@ def _later(polynomial: FloatArray, delay: FloatArray) -> FloatArray:
     for k in range(len(polynomial)):
         for j in range(k + 1):
             result[j] += polynomial[k] * comb(k, j) * (-delay) ** (k - j)
+    return result
+
+
+def _filtered(polynomial: FloatArray, section: FilterSection, length: float) -> FloatArray:
+    """Coefficients (DEGREE + 1,) over t / length of a polynomial behind a filter."""
+    result, current = np.zeros_like(polynomial), polynomial
+    for coefficient in section.expanded(len(polynomial)):
+        result = result + coefficient * current
+        current = derivative(current, length)
     return result
 
 

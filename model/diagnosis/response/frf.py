@@ -8,7 +8,7 @@ freedom.  Letters: F bins, S sensors, E elements, n degrees of freedom.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.linalg import expm
 
 from sprung.model.diagnosis.record.spectra import DEGREE, ComplexArray, Grid, derivative
 from sprung.model.diagnosis.response.structure import Structure
+from sprung.model.laws.channel import FilterSection
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, rigid_body_modes
 from sprung.model.signals import FloatArray
 
@@ -29,6 +30,12 @@ class Plant:
 
     structure: Structure
     grid: Grid
+
+    def behind(self, filters: tuple[tuple[int, FilterSection], ...]) -> Plant:
+        """The same system behind other filters of its sensors, which change nothing but the free motion."""
+        other = Plant(replace(self.structure, filters=filters), self.grid)
+        other.__dict__.update({name: value for name, value in self.__dict__.items() if name in _UNFILTERED})
+        return other
 
     @cached_property
     def impedance(self) -> ComplexArray:
@@ -277,3 +284,6 @@ class Plant:
             power = power @ power
             done += more
         return result
+
+
+_UNFILTERED = {name for name, value in vars(Plant).items() if isinstance(value, cached_property)} - {"_free_modes"}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.laws.channel import FilterSection
 from sprung.model.mechanics import FORCE, Mechanics, element_outputs, state_matrix, state_outputs
 from sprung.model.signals import FloatArray
 
@@ -35,7 +36,7 @@ class Branch:
 class Structure:
     """Matrices of a system, elastic modes appended as further degrees of freedom.
 
-    State of the free motion: [q, q', forces of the branches], 2n + b.  SI units.
+    State of the free motion: [q, q', forces of the branches, those of the sensors' filters], 2n + b + f.  SI units.
     """
 
     mass: FloatArray  # (n,)
@@ -51,6 +52,7 @@ class Structure:
     sensor_kind: np.ndarray  # (S,)
     body_of_dof: np.ndarray  # (n,), -1 for an elastic mode
     branches: tuple[Branch, ...] = ()  # b of them
+    filters: tuple[tuple[int, FilterSection], ...] = ()  # of the sensors, by their index, with f states together
 
     @classmethod
     def nominal(cls, mechanics: Mechanics, sensors: np.ndarray) -> Structure:
@@ -72,8 +74,9 @@ class Structure:
         )
 
     def same(self, other: Structure) -> bool:
-        """Whether another structure is equal in all matrices and branches."""
-        pairs = ((getattr(self, one.name), getattr(other, one.name)) for one in fields(self) if one.name != "branches")
+        """Whether another structure is equal in all matrices and branches: filters do not move anything."""
+        apart = ("branches", "filters")
+        pairs = ((getattr(self, one.name), getattr(other, one.name)) for one in fields(self) if one.name not in apart)
         return self.branches == other.branches and all(np.array_equal(mine, theirs) for mine, theirs in pairs)
 
     @property
@@ -97,11 +100,19 @@ class Structure:
         return damping
 
     @property
-    def states(self) -> int:
+    def moving(self) -> int:
+        """States of the bodies and branches, without those of the sensors' filters."""
         return 2 * len(self.mass) + len(self.branches)
 
+    @property
+    def states(self) -> int:
+        return self.moving + sum(section.order for _, section in self.filters)
+
     def state_matrix(self) -> FloatArray:
-        """A of the free motion, shape (2n + b, 2n + b)."""
+        """A of the free motion, shape (2n + b + f, 2n + b + f).
+
+        The states of filters are those of their own free motion, beside their steady response to that of the bodies.
+        """
         n = len(self.mass)
         A = np.zeros((self.states, self.states))
         A[: 2 * n, : 2 * n] = state_matrix(self.mass, self.K, self.C)
@@ -111,6 +122,10 @@ class Structure:
             A[n : 2 * n, i] = -h / self.mass
             A[i, n : 2 * n] = branch.stiffness * h
             A[i, i] = -1 / branch.time
+        at = self.moving
+        for _, section in self.filters:
+            A[at : at + section.order, at : at + section.order] = section.companion()
+            at += section.order
         return A
 
     def padded(self, ports: FloatArray) -> FloatArray:
@@ -118,7 +133,7 @@ class Structure:
         return np.pad(ports, ((0, 0), (0, len(self.H) - ports.shape[1])))
 
     def motion_rows(self, ports: FloatArray) -> FloatArray:
-        """Output rows (2m, 2n + b): deflections along ports (m, E), then their rates."""
+        """Output rows (2m, 2n + b + f): deflections along ports (m, E), then their rates."""
         along = ports @ self.H
         m, n = along.shape
         rows = np.zeros((2 * m, self.states))
@@ -126,14 +141,14 @@ class Structure:
         return rows
 
     def force_columns(self, ports: FloatArray) -> FloatArray:
-        """Input columns (2n + b, m) of forces along ports (m, E)."""
+        """Input columns (2n + b + f, m) of forces along ports (m, E)."""
         n = len(self.mass)
         columns = np.zeros((self.states, len(ports)))
         columns[n : 2 * n] = -(ports @ self.H).T / self.mass[:, None]
         return columns
 
     def sensor_rows(self) -> FloatArray:
-        """Output rows of the sensors in free motion, (S, 2n + b)."""
+        """Output rows of the sensors in free motion, (S, 2n + b + f), without their filters."""
         n = len(self.mass)
         of_elements = element_outputs(self.sensor_kind, self.L, self.stiffness, self.damping)
         rows = state_outputs(self.sensor_kind, self.S, self.H, self.state_matrix(), of_elements)

@@ -8,6 +8,7 @@ import numpy as np
 
 from sprung.model.diagnosis.response.structure import Branch, Structure
 from sprung.model.laws import BodyLaw, ElementLaw, Law, Observed, SensorLaw, SpringDamper, StructureLaw
+from sprung.model.laws.undone import is_modelled
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -19,7 +20,7 @@ class Term:
     """One law at one location; parameters in the law's order and units."""
 
     law: Law
-    location: str  # element, body, support, sensor or input channel; "left|right" of a pair or an axle
+    location: str  # element, body, support, sensor or input channel; "left|right" of a pair or an axle, or of sensors
     parameters: tuple[float, ...]
     variant: str = ""  # of body laws: shape of the mode, or direction of the force
     equivalent: tuple[float, float] = (0.0, 0.0)  # equivalent stiffness N/m and damping N s/m, part of the plant
@@ -86,6 +87,11 @@ class Term:
         return any(value <= spec.low or value >= spec.high for spec, value in pairs)
 
     @property
+    def places(self) -> tuple[str, ...]:
+        """The names of its location."""
+        return tuple(self.location.split("|"))
+
+    @property
     def key(self) -> tuple[str, str, str]:
         return (self.location, self.law.name, self.variant)
 
@@ -105,11 +111,11 @@ def typical_scales(law: Law, motion: Observed) -> tuple[float, ...]:
 
 
 def given_terms(system: System) -> tuple[Term, ...]:
-    """The laws of the system file, except faults of measurements, which are compensated in the signals."""
+    """The laws of the system file, except faults of measurements that are compensated in the signals."""
     found = []
     for placed in system.laws:
         law = placed.law
-        if isinstance(law, SensorLaw):
+        if isinstance(law, SensorLaw) and not is_modelled(placed, system.sensors):
             continue
         scales = tuple(max(abs(value), 1e-12) for value in placed.values)
         variant = placed.variant

@@ -88,7 +88,7 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
         answer = (projector.factor @ direct)[:, :, 0]
         impedance = plant.impedance[band, : fit.forward.elements] * shape_e
         answer = answer + np.einsum("fse,fe->fs", projector.of_force[:, :, : fit.forward.elements], impedance)
-        score, amplitudes = ScalarResponse(projector, answer * g[:, None]).scores(h)
+        score, amplitudes = ScalarResponse.of(projector, answer * g[:, None]).scores(h)
         score = np.where(amplitudes > 0, score, 0.0)
         i = int(np.argmax(score))
         amplitude = amplitudes[i]
@@ -152,7 +152,7 @@ def _refined_line(
     dof = projector.problem.system.mechanics.dofs.index(f"{name}.{variant}")
     time = grid.start + grid.time + CLOCK_LEAD
     best: tuple[float, float, FloatArray] = (-1.0, 0.0, np.zeros(2))
-    channel = ScalarResponse(projector, projector.of_load[:, :, dof])
+    channel = ScalarResponse.of(projector, projector.of_load[:, :, dof])
     for offset in np.linspace(-0.6, 0.6, 13):
         frequency = (bin_number + offset) / grid.length
         if frequency <= 0:

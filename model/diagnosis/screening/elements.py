@@ -46,7 +46,7 @@ class TrialElement:
         thin = slice(None, None, OVERSAMPLING)
         k, c = float(element.stiffness), float(element.damping)
         seen = observe(d[thin], v[thin], 1 / projector.grid.step, k, c)
-        channel = ScalarResponse(projector, projector.of_port(port))
+        channel = ScalarResponse.of(projector, projector.of_port(port))
         return cls(projector, location, d, v, seen, element, channel)
 
     def spectra(self, term: Term, trials: FloatArray) -> ComplexArray:

@@ -32,5 +32,6 @@ MASS = Family("mass")
 PART = Family("part")
 STRUCTURE = Family("structure", freedom=None, look_elsewhere=lambda rules: rules.of_places)
 SENSOR = Family("sensor")
+FILTER = Family("filter", look_elsewhere=lambda rules: rules.of_places)
 INPUT = Family("input", rank=0)  # channels of supports, compensated before anything else
 FORCE = Family("force", rank=0)  # measured forces, fitted as a law is

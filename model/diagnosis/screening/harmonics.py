@@ -39,7 +39,7 @@ def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Candida
     absent = Candidate(Term(law, location, law.absent), 0.0, HARMONIC)
     names, rules = supports(projector.problem.system), projector.problem.rules.screening
     at = [names.index(name) for name in location.split("|")]
-    channel = ScalarResponse(projector, projector.of_support[:, :, at].sum(axis=2))
+    channel = ScalarResponse.of(projector, projector.of_support[:, :, at].sum(axis=2))
     fundamentals, products, sizes = _products(projector.grid, law, channel, rules)
     tests = len(fundamentals) * len(law.harmonics)
     best = np.argmax(products, axis=1)

@@ -196,15 +196,24 @@ class Projector:
 class ScalarResponse:
     """Scores of columns of the form response (F, S) times scalar spectrum h (F,), for all trials at once."""
 
-    def __init__(self, projector: Projector, response: ComplexArray) -> None:
-        weighted = (response * projector.grid.weight[:, None]).conj()
-        self.product = np.einsum("fs,fs->f", weighted, projector.complex_residual)
-        self.size = np.sum(np.abs(weighted) ** 2, axis=1)
+    def __init__(self, product: ComplexArray, size: FloatArray, inside: ComplexArray) -> None:
+        """Of the conjugate response's product with the residual (F,) and with the projection's basis (F, q).
+
+        size: the response's square, (F,).
+        """
+        self.product, self.size = product, size
         # as real rows (2 F,), which halves the work of the real part of complex products
-        self._product = np.concatenate([self.product.real, self.product.imag])
-        self._size = np.concatenate([self.size, self.size])
-        inside = np.einsum("fs,fsq->fq", weighted, projector.complex_q, optimize=True)
+        self._product = np.concatenate([product.real, product.imag])
+        self._size = np.concatenate([size, size])
         self._inside = np.concatenate([inside.real, inside.imag])
+
+    @classmethod
+    def of(cls, projector: Projector, response: ComplexArray) -> ScalarResponse:
+        """Of a whitened response (F, S)."""
+        weighted = (response * projector.grid.weight[:, None]).conj()
+        product = np.einsum("fs,fs->f", weighted, projector.complex_residual)
+        inside = np.einsum("fs,fsq->fq", weighted, projector.complex_q, optimize=True)
+        return cls(product, np.sum(np.abs(weighted) ** 2, axis=1), inside)
 
     def scores(self, h: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Statistics and amplitudes of trials h (trials, F)."""

@@ -7,13 +7,21 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.screening.bodies import body_candidates
 from sprung.model.diagnosis.screening.elements import element_candidates
 from sprung.model.diagnosis.screening.families import ELEMENT, Family
+from sprung.model.diagnosis.screening.filters import filter_candidates
 from sprung.model.diagnosis.screening.harmonics import harmonic_candidates
 from sprung.model.diagnosis.screening.score import Candidate, Projector, Screening
 from sprung.model.diagnosis.screening.sensors import measurement_candidates
 from sprung.model.diagnosis.screening.structures import structure_candidates
 from sprung.model.laws import Law
 
-GROUPS = (element_candidates, harmonic_candidates, body_candidates, structure_candidates, measurement_candidates)
+GROUPS = (
+    element_candidates,
+    harmonic_candidates,
+    body_candidates,
+    structure_candidates,
+    measurement_candidates,
+    filter_candidates,
+)
 
 
 def screen(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = True) -> Screening:

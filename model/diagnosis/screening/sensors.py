@@ -26,7 +26,7 @@ from sprung.model.laws.base import Channels
 
 def measurement_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
     """Every fault of a measurement at every sensor and input channel that may have it."""
-    faults = [law for law in laws if isinstance(law, SensorLaw) and law.response is not None]
+    faults = [law for law in laws if isinstance(law, SensorLaw) and law.response is not None and not law.filters]
 
     def at(channel: Channels) -> list[SensorLaw]:
         return [law for law in faults if channel in law.at]

@@ -12,6 +12,7 @@ from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import opened
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
+from sprung.model.diagnosis.response.forward import response_of
 from sprung.model.diagnosis.response.point import Point, advance, fixed
 from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, evaluated_in_time, typical_scales
 from sprung.model.diagnosis.screening.score import Candidate
@@ -39,14 +40,17 @@ def _far_from_nominal(problem: Problem, base: Fit) -> bool:
 
 def start_of(base: Fit, candidate: Candidate) -> Point:
     """The present model with the candidate's term added; other values are left to the first Gauss-Newton step."""
-    point = base.point
-    state = point.state
+    point, structure = base.point, base.forward.plant.structure
     law = candidate.term.law
+    state, of_filters = np.split(point.state, [structure.moving])
     if law.adds_motion:  # a degree of freedom, last in q and in q'
-        n = (len(state) - len(base.forward.plant.structure.branches)) // 2
+        n = len(structure.mass)
         state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
-    more = branches_of(candidate.term, base.forward.system, base.forward.plant.structure)
-    state = np.pad(state, (0, len(more)))  # their forces
+    more = branches_of(candidate.term, base.forward.system, structure)
+    response = response_of(candidate.term)
+    filtered = 0 if response is None else len(candidate.term.places) * sum(one.order for one in response.sections)
+    # forces of the branches, and what filters still show of the time before
+    state = np.concatenate([state, np.zeros(len(more)), of_filters, np.zeros(filtered)])
     warm_start = point.warm_start
     if evaluated_in_time(candidate.term):
         warm_start = (*warm_start, base.force_along(candidate.term))

@@ -17,7 +17,11 @@ from tests.diagnosis_cases import problem_of, quarter_car, simulate
 
 VELOCITY = 1  # column of the wheel's
 CHANNELS = {"displacement": ("d", 1e-5), "velocity": ("v", 5e-4), "acceleration": ("w", 3e-2)}
-FAULTS = {"sensor_gain": ("gain", 0.93), "sensor_lag": ("delay", 0.004), "sensor_bias": ("offset", 0.005)}
+FAULTS = {
+    "sensor_gain": (SensorResponse(gain=0.93), 0.93),
+    "sensor_lag": (SensorResponse(delay=0.004), 0.004),
+    "sensor_bias": (SensorResponse(offset=0.005), 0.005),
+}
 HALF = 200  # samples, of the differentiator
 
 
@@ -89,8 +93,7 @@ def _measured_by(
     ],
 )
 def test_a_wrong_channel_is_distinguished_from_others(quantities: tuple[str, ...], faulty: str, effect: str) -> None:
-    name, value = FAULTS.get(effect, ("", 0.0))
-    response = SensorResponse(**{name: value}) if effect else None
+    response, value = FAULTS.get(effect, (None, 0.0))
     system, values, rate = _measured_by(quantities, faulty, response)
     signals, options = prepare(system, values, rate).signals, Options()
     laws = tuple(find_law(effect) for effect in FAULTS)
