@@ -16,6 +16,7 @@ from sprung.model.schema import ElementSensor, ForceInput
 from sprung.model.system import System
 from sprung.service.report import ink
 from sprung.service.report.layout import Layout, Point, lay_out
+from sprung.service.report.words import place_words
 
 WIDTH, NARROWEST, TALLEST = 10.5, 3.2, 5.6  # in
 WORDS_BESIDE = 3.6  # in, of what was found
@@ -222,7 +223,7 @@ def _call_out(axes: Axes, layout: Layout, places: Mapping[str, Point], findings:
         beside = (place[0] + 1.1, place[1]) if layout.slant == 0 else (x, y)
         words = "\n".join(textwrap.wrap(findings[name], 44 if len(known) <= 2 else 26)[:3])
         axes.annotate(
-            f"{name.replace('|', ', ')}\n{words}",
+            f"{place_words(name)}\n{words}",
             xy=place,
             xytext=beside,
             fontsize=10 if len(known) <= 2 else 8.5,

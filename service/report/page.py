@@ -54,7 +54,7 @@ def _groups(report: Report, drawn: Collection[str], laws: words.Laws) -> list[di
     for number, finding in enumerate(report.findings):
         own = [key for key in (f"force_{number}", f"residual_{number}") if key in drawn]
         if own:
-            title = f"{finding.location}: {words.finding_words(finding, laws)}"
+            title = f"{words.place_words(finding.location)}: {words.finding_words(finding, laws)}"
             groups.append({"title": title, "pictures": own, "note": ""})
     if "fit" in drawn:
         groups.append(

@@ -9,6 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from sprung.model.diagnosis.report.report import Report
+from sprung.model.text import some
 from sprung.service.report import ink
 
 
@@ -108,7 +109,7 @@ def location_figure(report: Report) -> Figure | None:
         axes = figure.add_subplot()
         colours = [ink.HIGHLIGHT if name in owners else "#aeb8c2" for name, _ in best]
         axes.barh(np.arange(len(best)), [max(s, 0.0) for _, s in best], color=colours, height=0.66)
-        axes.set_yticks(np.arange(len(best)), [name for name, _ in best])
+        axes.set_yticks(np.arange(len(best)), [some(name.split("|"), 1) for name, _ in best])
         axes.set_xscale("symlog", linthresh=10)
         axes.set_xlabel("best score of any law there (chi-square)")
         axes.set_title("where")

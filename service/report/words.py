@@ -9,6 +9,7 @@ from sprung.model.diagnosis.report.report import Finding, LawParameter, Report
 from sprung.model.diagnosis.report.sentences import names_in_words
 from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.basis import UNKNOWN
+from sprung.model.text import some
 from sprung.service.report.ink import engineering
 from sprung.service.report.values import largest_bias
 
@@ -67,6 +68,15 @@ def finding_words(finding: Finding, laws: Laws = CATALOGUE) -> str:
         return f"{name} of {quantity(main[0])}"
     numbers = ", ".join(f"{p.name} {quantity(p)}" for p in main)
     return f"{name}, {numbers}" if numbers else name
+
+
+def place_words(location: str, most: int = 3) -> str:
+    """A place in a picture, which has room for few of the channels that share a fault.
+
+    >>> place_words("car_1l|car_1r"), place_words("car_1l|car_1r|car_2l|car_2r")
+    ('car_1l, car_1r', 'car_1l, car_1r, car_2l and 1 more')
+    """
+    return some(location.split("|"), most)
 
 
 def headline(report: Report, laws: Laws = CATALOGUE) -> str:

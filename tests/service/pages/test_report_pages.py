@@ -173,3 +173,10 @@ def test_the_drawing_calls_out_what_was_located_wherever_it_is(place: str) -> No
     figure = draw_system(SYSTEM, {place: "some words"}, {})
     said = any("some words" in text.get_text() for text in figure.axes[0].texts)
     assert said == (place != "nowhere")
+
+
+def test_a_fault_that_all_sensors_share_has_room_in_the_drawing() -> None:
+    """Twelve names in a row are wider than the vehicle, which then had to be drawn smaller."""
+    figure = draw_system(SYSTEM, {"|".join(SYSTEM.sensors): "some words"}, {})
+    (said,) = [text.get_text() for text in figure.axes[0].texts if "some words" in text.get_text()]
+    assert said == "car_1l, car_1r, car_2l and 9 more\nsome words"
