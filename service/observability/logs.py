@@ -92,5 +92,6 @@ def set_up(form: str, level: str) -> None:
     handler.addFilter(untold)
     handler.addFilter(foreseen)
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    logging.captureWarnings(True)  # which would be no lines of that form
     logging.getLogger("python_multipart").setLevel(logging.ERROR)  # what strangers send wrong would fill the log
     logging.getLogger("sprung").setLevel(level.upper())
