@@ -15,7 +15,7 @@ from sprung.service.api.recordings import job_dict
 from sprung.service.monitoring.views import alarm_dict
 from sprung.service.pages.routes import linker
 from sprung.service.rendering.render import render
-from sprung.service.store import fleet, lists
+from sprung.service.store import fleet, lists, work
 from sprung.service.store.fleet import WantedAlarms
 
 router = APIRouter(include_in_schema=False)
@@ -53,8 +53,10 @@ async def work_page(core: CoreOf, vehicle: Annotated[str, Query(max_length=128)]
     """What is being worked on, and what came of it."""
 
     def query(connection: Connection) -> dict[str, Any]:
+        jobs = lists.list_jobs(connection, SHOWN)
         return {
-            "jobs": [job_dict(row) for row in lists.list_jobs(connection, SHOWN)],
+            "jobs": [job_dict(row) for row in jobs],
+            "names": work.recording_names(connection, [row.recording_id for row in jobs if row.recording_id]),
             "reports": [report_dict(row) for row in lists.list_reports(connection, SHOWN)],
             "dead": [delivery_dict(row) for row in lists.list_deliveries(connection, SHOWN, state="dead")],
         }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,6 +87,12 @@ def get_recording(connection: Connection, recording_id: str) -> RecordingRow | N
     """A recording by id."""
     row = _one(connection, recordings, recording_id)
     return None if row is None else RecordingRow(*row)
+
+
+def recording_names(connection: Connection, ids: Collection[str]) -> dict[str, str]:
+    """What users called recordings, by id."""
+    query = select(recordings.c.id, recordings.c.name).where(recordings.c.id.in_(ids))
+    return {row.id: row.name for row in connection.execute(query)}
 
 
 def upload_name(digest: str, recording_id: str, extension: str) -> str:

@@ -31,7 +31,7 @@ const acts = (() => {
   function told(now) {
     if (now.state === "failed") return `failed: ${now.error}`;
     if (now.state === "done") return "done";
-    return `${now.state} ${Math.round(100 * now.progress)} %`;
+    return now.progress > 0 ? `${now.state} ${Math.round(100 * now.progress)} %` : now.state; // how long a recording is shows at its end
   }
 
   const outcome = () => document.getElementById("outcome");

@@ -39,12 +39,17 @@
     const followed = async () => {
       let answer = {};
       try { answer = JSON.parse(request.responseText); } catch { /* of a proxy, not of the service */ }
-      if (request.status !== 202) { told.textContent = answer.detail || `refused (${request.status})`; return; }
+      if (request.status !== 202) {
+        told.textContent = answer.detail || `refused (${request.status})`;
+        bar.hidden = true;
+        return;
+      }
       await listJobs();
       const now = await acts.follow(answer.id, (job) => {
         told.textContent = `${job.kind} ${acts.told(job)}`;
         bar.max = 1;
-        bar.value = job.progress;
+        if (job.progress > 0) bar.value = job.progress;
+        else bar.removeAttribute("value"); // it is not known how far it is
       });
       if (now.state === "done") setTimeout(() => location.reload(), 1200);
       else await listJobs();

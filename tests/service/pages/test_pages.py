@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from html.parser import HTMLParser
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
+from sprung.model.system import System
 from sprung.model.tracking.state import Alarm
 from sprung.service.api.fleet import load_view
 from sprung.service.core import Core
@@ -18,6 +20,7 @@ from sprung.service.rendering.render import with_std
 from sprung.service.sources.live import FeedStatus
 from sprung.service.store import fleet, work
 from sprung.service.store.work import JobRow
+from tests.service_fakes import FakeIdentifier, make_window
 
 BROWSER = {"accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
 FIRST = Alarm("change", "primary_11l.damping", 0, 1, "warning", -0.1, 0.02)
@@ -43,6 +46,24 @@ def test_a_vehicle_of_which_nothing_was_heard_is_not_called_good(client: TestCli
         assert (one["vehicle"], one["health"], one["last_window"]) == ("new", "check_function", None)
     assert (listed["counts"]["ok"], listed["counts"]["check_function"]) == (0, 1)
     assert client.get("/vehicles?health=ok").json()["vehicles"] == []
+
+
+@pytest.mark.parametrize(
+    ("chi_square", "told"),
+    [(1.0, "fits: the noise of the measurements explains"), (9.0, "does not fit: these errors are larger than")],
+)
+def test_errors_of_sensors_stand_beside_what_they_mean(
+    client: TestClient, core: Core, system: System, chi_square: float, told: str
+) -> None:
+    """Of a vehicle that hardly moves they are large, and no fault."""
+    identifier = core.engine.identifier
+    assert isinstance(identifier, FakeIdentifier)
+    identifier.chi_square = chi_square
+    core.pipeline.process("a", [make_window(system, n) for n in range(3)])
+    page = client.get("/pages/vehicles/a", headers=BROWSER).text
+    assert f"The newest window {told}" in page
+    assert torn_cells(page) == torn_cells(client.get("/", headers=BROWSER).text) == []
+    assert "see “under model”" not in page  # which is there from the second version on
 
 
 def test_a_page_never_repeats_a_path_as_markup(client: TestClient) -> None:
@@ -151,6 +172,16 @@ def test_jobs_that_wait_or_run_can_be_cancelled_where_they_are_listed(client: Te
     assert sorted(offered) == ["queued", "running"]
 
 
+@pytest.mark.parametrize(("progress", "told"), [(0.0, "running"), (0.2, "running 20 %")])
+def test_how_far_a_job_is_stands_there_where_it_is_known(
+    client: TestClient, core: Core, progress: float, told: str
+) -> None:
+    """How long a recording is shows at its end."""
+    with core.store.write() as connection:
+        work.add_job(connection, JobRow("r", "recording", "running", None, None, progress, None, None, 1, 1))
+    assert f">{told}</span>" in client.get("/pages/work").text
+
+
 def test_the_page_of_work_shows_live_buses_and_what_is_wrong_with_them(client: TestClient, core: Core) -> None:
     assert "Live buses" not in client.get("/pages/work").text
     down = FeedStatus("socketcan:can0", "car-17", "down", "no such device", 0.0, 3, 2, 1, 5, 4)
@@ -160,7 +191,47 @@ def test_the_page_of_work_shows_live_buses_and_what_is_wrong_with_them(client: T
         assert text in shown
 
 
-RECORDED = {"recording": "r", "vehicle": "tram", "windows": {"used": 7, "repaired": 0, "dropped": 2}}
+class _Cells(HTMLParser):
+    """Cells that hold text beside elements: on a phone, where cells are flexible boxes, each would be a column."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.torn: list[str] = []
+        self._open: list[str] = []
+        self._text, self._elements = "", 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag == "td":
+            self._open, self._text, self._elements = [], "", 0
+        elif self._open == ["td"]:
+            self._elements += 1
+        if tag not in ("br", "input", "img", "meta", "link"):
+            self._open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in self._open:
+            while self._open.pop() != tag:
+                pass
+        if tag == "td" and self._text.strip() and self._elements:
+            self.torn.append(self._text)
+
+    def handle_data(self, data: str) -> None:
+        if self._open == ["td"]:
+            self._text += data
+
+
+def torn_cells(page: str) -> list[str]:
+    """Their text."""
+    cells = _Cells()
+    cells.feed(page)
+    return cells.torn
+
+
+RECORDED = {
+    "recording": "r",
+    "vehicle": "tram",
+    "windows": {"used": 7, "repaired": 0, "dropped": 2, "uninformative": 4},
+}
 REPORTED = {"report": "one", "verdict": "missing_physics"}
 
 
@@ -172,9 +243,14 @@ def test_the_page_of_work_says_what_came_of_recordings_and_diagnoses(client: Tes
     ]
     with core.store.write() as connection:
         for number, (kind, state, result, error) in enumerate(ended):
-            work.add_job(connection, JobRow(str(number), kind, state, None, None, 1.0, result, error, number, number))
+            row = work.RecordingRow(str(number), None, f"ride {number}.blf", "upload", None, 1, None, 1, None)
+            work.add_recording(connection, row)
+            work.add_job(connection, JobRow(str(number), kind, state, row.id, None, 1.0, result, error, number, number))
     page = client.get("/pages/work")
     assert page.status_code == 200, page.text
+    assert torn_cells(page.text) == []
+    assert all(f"ride {number}.blf" in page.text for number in range(3))
+    assert "7 windows used, 0 repaired, 2 dropped, 4 uninformative" in page.text
     assert "7 windows used, 0 repaired, 2 dropped" in page.text and "report: missing physics" in page.text
     assert "the file is empty" in page.text
 
