@@ -279,6 +279,9 @@ class AcceptanceRules:
     better_than_promised: float = rule(4.0, "times that a fit may exceed its first step's promise; chosen", 2.0, 8.0)
     most_left: float = rule(0.5, "of the unmeasured forces that earlier findings left; chosen", 0.3, 0.8)
     diverged: float = rule(1.5, "rise of the reduced chi-square on the whole recording; chosen", 1.2, 3.0)
+    isolated: float = rule(
+        30.0, "chi-square by which leaving out any other sensor of a group is worse; derived: no chance", 15.0, 60.0
+    )
     input_faults: int = rule(2, "of input channels that are looked for; chosen", 1, 4)
     input_rounds: int = rule(3, "of estimating and compensating an input fault; chosen", 2, 5)
     input_rival: float = rule(0.3, "of the leading input fault's score, from which others are tried; chosen", 0.15, 0.6)

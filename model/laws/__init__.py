@@ -26,6 +26,7 @@ from sprung.model.laws.sensor_faults import (
     HIGH_PASS,
     MOUNTING_RESONANCE,
     SENSOR_BIAS,
+    SENSOR_ERROR,
     SENSOR_GAIN,
     SENSOR_LAG,
     SENSOR_NOISE,
@@ -87,6 +88,7 @@ CATALOGUE: tuple[Law, ...] = (
     SENSOR_BIAS,
     SENSOR_NOISE,
     SENSOR_STUCK,
+    SENSOR_ERROR,
     AXLE_DELAY,
 )
 

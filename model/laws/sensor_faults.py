@@ -174,6 +174,15 @@ SENSOR_STUCK = SensorLaw(
     sentence="the sensor repeats one value",
     stuck=True,
 )
+SENSOR_ERROR = SensorLaw(
+    name="sensor_error",
+    title="error of one sensor",
+    parameters=(),
+    absent=(),
+    looks_like="one channel shows what the others on the body contradict, and no law of a channel explains it",
+    confused_with=("unknown",),
+    sentence="the sensor shows something else than the motion of its body",
+)
 AXLE_DELAY = SensorLaw(
     name="axle_delay",
     title="axle placed at the wrong time",

@@ -167,6 +167,7 @@ def test_the_contracts_effects_are_all_there_with_parameters_in_its_order() -> N
         "sensor_bias": ("offset",),
         "sensor_noise": ("ratio",),
         "sensor_stuck": (),
+        "sensor_error": (),
     }
     for name, parameters in expected.items():
         assert find_law(name).names[: len(parameters)] == parameters

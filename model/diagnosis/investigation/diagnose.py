@@ -26,6 +26,10 @@ from sprung.model.diagnosis.investigation.judgement.significance import (
     without_refuted,
 )
 from sprung.model.diagnosis.investigation.measurements.common_delay import common_delay
+from sprung.model.diagnosis.investigation.measurements.contradicted import (
+    screened_anew,
+    without_contradicted,
+)
 from sprung.model.diagnosis.investigation.measurements.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.measurements.floor import leaves_more_than_noise
 from sprung.model.diagnosis.investigation.measurements.inputs import best_input_fault, compensate, nominal
@@ -44,6 +48,7 @@ from sprung.model.diagnosis.investigation.state import (
     Outcome,
     Progress,
     Recorded,
+    share_done,
 )
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
@@ -98,6 +103,9 @@ def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
     # the residual of an estimated delay, scale or position is not searched for unmodelled dynamics
     uncertain, notes = any(fault.value is not None for fault in state.setup_faults), state.notes
     for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
+        rest = None if state.only else without_contradicted(state)
+        if rest is not None:
+            return _beside_contradicted(state, rest, progress)
         before = state
         state = next_finding(state, number, progress)
         if state.problem.work is not None and state.problem.worked_out:
@@ -113,6 +121,28 @@ def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
         if common_delay(state) is not None:
             break  # it is corrected before anything else is sought
     return state
+
+
+def _beside_contradicted(state: Investigation, rest: Investigation, progress: Progress) -> Investigation:
+    """Findings beside a contradicted sensor: its own faults if these leave nothing unexplained; else without it.
+
+    rest: the investigation without the sensor.
+    """
+    sensor = rest.contradictions[-1].location
+    progress(share_done(len(state.found)), f"the other sensors contradict {sensor}")
+    own = replace(_one_by_one(replace(state, only=sensor), progress), only="")
+    return own if _explains(own, sensor, progress) else _one_by_one(screened_anew(rest, state), progress)
+
+
+def _explains(own: Investigation, sensor: str, progress: Progress) -> bool:
+    """Whether faults of a contradicted sensor leave nothing to be found, nor noise that its peers do not have."""
+    i = own.signals.sensor_names.index(sensor)
+    ratio = own.problem.noise.sensors / own.declared.sensors
+    noisy = ratio[i] > own.options.rules.verdict.slack * max(1.0, float(np.median(ratio)))
+    if noisy or leaves_more_than_noise(own):
+        return False
+    further = next_finding(own, len(own.found), progress)
+    return len(further.found) == len(own.found) and further.calibrations == own.calibrations
 
 
 def _still_rejected(state: Investigation, before: Fit) -> bool:

@@ -81,6 +81,15 @@ class NoiseFault:
 
 
 @dataclass(frozen=True)
+class Contradiction:
+    """A sensor that shows something else than the motion of its body, which the others determine; it is left out."""
+
+    location: str
+    share: float  # rms of what it shows beside that motion, over its rms
+    form: str  # of that, in words
+
+
+@dataclass(frozen=True)
 class Nominal:
     """The nominal structure identified on the first part of the signals, with the screening of its residual."""
 
@@ -152,6 +161,8 @@ class Investigation:
     found: tuple[AcceptedFinding, ...] = ()
     input_faults: tuple[InputFault, ...] = ()
     setup_faults: tuple[SetupFault, ...] = ()
+    contradictions: tuple[Contradiction, ...] = ()  # sensors that were left out
+    only: str = ""  # the sensor at which faults are sought; empty: everything is sought everywhere
     notes: tuple[str, ...] = ()
     wider: TriedWider | None = None  # of the present fit or an earlier one; None: not tried yet
     tried: TriedTrials | None = None  # of the last competition, which may be repeated under other options

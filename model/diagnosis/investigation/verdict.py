@@ -39,6 +39,11 @@ class HeldOutErrors:
     after: FloatArray  # with the findings
     floor: FloatArray  # bounded noise
 
+    def at(self, sensors: Sequence[int]) -> HeldOutErrors:
+        """The errors of some sensors."""
+        chosen = list(sensors)
+        return HeldOutErrors(self.before[chosen], self.after[chosen], self.floor[chosen])
+
     def bounded(self, rules: VerdictRules = RULES.verdict) -> FloatArray:
         """The floor, with the sampling error of a perfect model, (S,)."""
         return np.hypot(self.floor, rules.least)

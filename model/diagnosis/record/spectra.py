@@ -24,6 +24,7 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 DEGREE = 5  # of the polynomials: quadratic inputs, integrated twice by a free body
 OVERSAMPLING = 4  # laws with kinks make harmonics beyond the Nyquist frequency of the record
+_MAIN = 0.8  # of the power, in the band that is reported
 HIGH_PASS_ORDER = 4  # Butterworth, run forwards and backwards
 
 
@@ -219,3 +220,13 @@ def detrend_ends(series: FloatArray, slopes: tuple[FloatArray, FloatArray] | Non
     remainder = series - grid.monomials @ coefficients
     coefficients[0] = remainder.mean(axis=0)
     return coefficients
+
+
+def main_band(error: FloatArray, sample_rate: float) -> tuple[float, float]:
+    """Band with most of the power of an error (T,), Hz."""
+    power = np.abs(np.fft.rfft(error - np.mean(error))) ** 2
+    share = np.cumsum(power) / max(float(np.sum(power)), 1e-300)
+    frequency = np.fft.rfftfreq(len(error), 1 / sample_rate)
+    ends = [(1 - _MAIN) / 2, (1 + _MAIN) / 2]
+    low, high = (float(frequency[min(int(np.searchsorted(share, end)), len(frequency) - 1)]) for end in ends)
+    return low, high

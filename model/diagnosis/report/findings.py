@@ -10,7 +10,7 @@ from sprung.model.diagnosis.investigation.configuration.effects import WRONG_SCA
 from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
 from sprung.model.diagnosis.investigation.measurements.calibration import faulty
 from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
-from sprung.model.diagnosis.investigation.state import AcceptedFinding, InputFault, NoiseFault, Outcome
+from sprung.model.diagnosis.investigation.state import AcceptedFinding, Contradiction, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.verdict import kind_of
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Finding, LawParameter
@@ -20,7 +20,7 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ReportRules, Rules
 from sprung.model.diagnosis.selection.compete import unnamed_alike
 from sprung.model.laws.basis import UNKNOWN
-from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
+from sprung.model.laws.sensor_faults import SENSOR_ERROR, SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.system import System
 from sprung.model.units import confusion
 
@@ -31,6 +31,7 @@ def findings_of(outcome: Outcome) -> list[Finding]:
     if judgement.rejected:
         return [setup_finding(state.system, fault) for fault in state.setup_faults if fault.effect.model_free]
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in state.prepared.stuck]
+    ranked += [(np.inf, _contradiction_finding(fault)) for fault in state.contradictions]
     ranked += [(np.inf, setup_finding(state.system, f)) for f in state.setup_faults]
     ranked += [
         (f.score, _input_finding(state.system, f)) for f in state.input_faults if not within_tolerance(state, f.term)
@@ -228,4 +229,17 @@ def _stuck_finding(name: str, at: float) -> Finding:
         p_value=None,
         delta_bic=None,
         sentence=f"{name}: repeats one value from {at:.2f} s on; it was left out of the diagnosis",
+    )
+
+
+def _contradiction_finding(fault: Contradiction) -> Finding:
+    share = f"{100 * fault.share:.2g} % of its signal is no motion of its body ({fault.form})"
+    return Finding(
+        location=fault.location,
+        effect=SENSOR_ERROR.name,
+        kind=kind_of(SENSOR_ERROR),
+        parameters=(LawParameter("share", fault.share, 0.0, "1"),),
+        p_value=None,
+        delta_bic=None,
+        sentence=f"{fault.location}: the other sensors contradict it; {share}; it was left out of the diagnosis",
     )

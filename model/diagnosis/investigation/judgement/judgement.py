@@ -16,14 +16,13 @@ from sprung.model.diagnosis.investigation.state import HeldOutRuns, Investigatio
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.record.signals import Noise
+from sprung.model.diagnosis.record.spectra import main_band
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.laws import Law
-from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
+from sprung.model.laws.sensor_faults import SENSOR_ERROR, SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
-
-_BAND = 0.8  # of the residual's power, in the band that is reported
 
 
 def held_out_runs(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...]) -> HeldOutRuns:
@@ -87,7 +86,8 @@ def _kinds_of_faults(state: Investigation, noisy: tuple[NoiseFault, ...]) -> lis
     kinds = [kind_of(fault.effect) for fault in state.setup_faults]
     kinds += [_kind(state, fault.term, fault.term.law) for fault in state.input_faults]
     kinds += [kind_of(state.fit.point.terms[index].law) for index in faulty(state)]
-    return kinds + [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
+    counts = ((SENSOR_STUCK, state.prepared.stuck), (SENSOR_ERROR, state.contradictions), (SENSOR_NOISE, noisy))
+    return kinds + [kind_of(law) for law, faults in counts for _ in faults]
 
 
 def _kinds_of_physics(state: Investigation) -> list[EffectKind]:
@@ -186,13 +186,3 @@ def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun | None, p
     low, high = main_band(after.measured[:, worst] - after.simulated[:, worst], state.signals.sample_rate)
     sensor = state.signals.sensor_names[worst]
     return f"{size:.0f} % of {sensor} {noise}, most of it at {low:.2g} to {high:.2g} Hz; {suspect}"
-
-
-def main_band(error: FloatArray, sample_rate: float) -> tuple[float, float]:
-    """Band with most of the power of an error (T,), Hz."""
-    power = np.abs(np.fft.rfft(error - np.mean(error))) ** 2
-    share = np.cumsum(power) / max(float(np.sum(power)), 1e-300)
-    frequency = np.fft.rfftfreq(len(error), 1 / sample_rate)
-    ends = [(1 - _BAND) / 2, (1 + _BAND) / 2]
-    low, high = (float(frequency[min(int(np.searchsorted(share, end)), len(frequency) - 1)]) for end in ends)
-    return low, high

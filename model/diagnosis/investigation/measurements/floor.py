@@ -17,10 +17,12 @@ from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.signals import FloatArray
 
 
-def leaves_more_than_noise(state: Investigation) -> bool:
-    """Whether the findings so far leave an unexplained share."""
+def leaves_more_than_noise(state: Investigation, of: Sequence[str] | None = None) -> bool:
+    """Whether the findings so far leave an unexplained share, of the given sensors or of all."""
     run, rules = state.held.run(state.fit.point), state.options.rules.verdict
     errors = held_out_errors(run, run, state.held.noise_rms(state.fit, bounded(state)), rules)
+    if of is not None:
+        errors = errors.at([state.signals.sensor_names.index(name) for name in of])
     return bool(np.any(errors.unexplained(rules) > 0))
 
 

@@ -30,8 +30,9 @@ def untried(state: Investigation, candidates: Iterable[Candidate]) -> list[Candi
 
 
 def sought(state: Investigation, candidates: Iterable[Candidate]) -> list[Candidate]:
-    """The candidates without unnamed forces where these are not sought."""
-    return [h for h in candidates if state.options.unnamed or h.term.law.named]
+    """The candidates without unnamed forces where these are not sought, and only those of the sensor in question."""
+    here = [h for h in candidates if state.only in ("", h.location)]
+    return [h for h in here if state.options.unnamed or h.term.law.named]
 
 
 def _repeats(state: Investigation, candidate: Candidate) -> bool:
