@@ -282,6 +282,9 @@ class AcceptanceRules:
     isolated: float = rule(
         30.0, "chi-square by which leaving out any other sensor of a group is worse; derived: no chance", 15.0, 60.0
     )
+    steady: float = rule(6.0, "deviations of a clock's rate, of eight segments; derived: no chance", 4.0, 10.0)
+    clock_rounds: int = rule(4, "in which a clock's rate is estimated; chosen", 2, 6)
+    quartz: float = rule(1e-4, "rate of a clock against another; derived: 50 ppm of each quartz", 5e-5, 2e-4)
     input_faults: int = rule(2, "of input channels that are looked for; chosen", 1, 4)
     input_rounds: int = rule(3, "of estimating and compensating an input fault; chosen", 2, 5)
     input_rival: float = rule(0.3, "of the leading input fault's score, from which others are tried; chosen", 0.15, 0.6)

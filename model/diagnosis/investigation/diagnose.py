@@ -25,6 +25,7 @@ from sprung.model.diagnosis.investigation.judgement.significance import (
     without_insignificant,
     without_refuted,
 )
+from sprung.model.diagnosis.investigation.measurements.clock_drift import without_clock_drift
 from sprung.model.diagnosis.investigation.measurements.common_delay import common_delay
 from sprung.model.diagnosis.investigation.measurements.contradicted import (
     screened_anew,
@@ -101,6 +102,7 @@ def _with_several(state: Investigation, progress: Progress) -> Investigation | N
 def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
     """Findings one after the other, until the residual is noise."""
     # the residual of an estimated delay, scale or position is not searched for unmodelled dynamics
+    state = state if state.only else without_clock_drift(state) or state
     uncertain, notes = any(fault.value is not None for fault in state.setup_faults), state.notes
     for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
         rest = None if state.only else without_contradicted(state)
@@ -124,18 +126,21 @@ def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
 
 
 def _beside_contradicted(state: Investigation, rest: Investigation, progress: Progress) -> Investigation:
-    """Findings beside a contradicted sensor: its own faults if these leave nothing unexplained; else without it.
+    """Findings beside a contradicted sensor: a fault of it if that leaves nothing unexplained; else without it.
+
+    Of several faults of one sensor, one takes up what another lacks, and so do springs and dampers.
 
     rest: the investigation without the sensor.
     """
     sensor = rest.contradictions[-1].location
     progress(share_done(len(state.found)), f"the other sensors contradict {sensor}")
     own = replace(_one_by_one(replace(state, only=sensor), progress), only="")
-    return own if _explains(own, sensor, progress) else _one_by_one(screened_anew(rest, state), progress)
+    alone = len(own.found) <= len(state.found) + 1 and _explains(own, sensor, progress)
+    return own if alone else _one_by_one(screened_anew(rest, state), progress)
 
 
 def _explains(own: Investigation, sensor: str, progress: Progress) -> bool:
-    """Whether faults of a contradicted sensor leave nothing to be found, nor noise that its peers do not have."""
+    """Whether the faults of a contradicted sensor leave nothing to be found, nor noise that its peers do not have."""
     i = own.signals.sensor_names.index(sensor)
     ratio = own.problem.noise.sensors / own.declared.sensors
     noisy = ratio[i] > own.options.rules.verdict.slack * max(1.0, float(np.median(ratio)))

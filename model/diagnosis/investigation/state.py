@@ -90,6 +90,19 @@ class Contradiction:
 
 
 @dataclass(frozen=True)
+class ClockDrift:
+    """A group of sensors whose clock runs at another rate than the others'; it is put right."""
+
+    location: str  # channels joined by "|"
+    rate: float  # s/s, by which they become later
+    std: float
+
+    def beyond(self, rules: Rules) -> bool:
+        """Whether it drifts more than ordinary clocks do."""
+        return abs(self.rate) > rules.acceptance.quartz
+
+
+@dataclass(frozen=True)
 class Nominal:
     """The nominal structure identified on the first part of the signals, with the screening of its residual."""
 
@@ -162,6 +175,7 @@ class Investigation:
     input_faults: tuple[InputFault, ...] = ()
     setup_faults: tuple[SetupFault, ...] = ()
     contradictions: tuple[Contradiction, ...] = ()  # sensors that were left out
+    clock_drifts: tuple[ClockDrift, ...] = ()
     only: str = ""  # the sensor at which faults are sought; empty: everything is sought everywhere
     notes: tuple[str, ...] = ()
     wider: TriedWider | None = None  # of the present fit or an earlier one; None: not tried yet

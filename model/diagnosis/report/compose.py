@@ -11,7 +11,7 @@ from sprung.model.diagnosis.investigation.measurements.calibration import calibr
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome, Recorded
 from sprung.model.diagnosis.report.advice import LOST_PHASE, nothing_fits, search_ended, undecided
 from sprung.model.diagnosis.report.calibration import beyond_tolerance, calibration_of, in_words
-from sprung.model.diagnosis.report.findings import findings_of
+from sprung.model.diagnosis.report.findings import clock_in_words, findings_of
 from sprung.model.diagnosis.report.plot_data import plot_data_of
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
@@ -30,7 +30,8 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
     state, before, after = outcome.investigation, outcome.runs.before, outcome.runs.after
     judgement, names = outcome.judgement, state.signals.sensor_names
     findings, calibration = findings_of(outcome), calibration_of(outcome)
-    advice = [*state.prepared.notes, *state.notes]
+    clocks = [clock_in_words(drift) for drift in state.clock_drifts if not drift.beyond(state.options.rules)]
+    advice = [*state.prepared.notes, *clocks, *state.notes]
     if judgement.nothing_fits:
         advice.insert(0, nothing_fits(outcome))
     else:

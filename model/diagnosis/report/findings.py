@@ -10,7 +10,14 @@ from sprung.model.diagnosis.investigation.configuration.effects import WRONG_SCA
 from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
 from sprung.model.diagnosis.investigation.measurements.calibration import faulty
 from sprung.model.diagnosis.investigation.measurements.data_sheets import within_tolerance
-from sprung.model.diagnosis.investigation.state import AcceptedFinding, Contradiction, InputFault, NoiseFault, Outcome
+from sprung.model.diagnosis.investigation.state import (
+    AcceptedFinding,
+    ClockDrift,
+    Contradiction,
+    InputFault,
+    NoiseFault,
+    Outcome,
+)
 from sprung.model.diagnosis.investigation.verdict import kind_of
 from sprung.model.diagnosis.kinds import EffectKind
 from sprung.model.diagnosis.report.report import Finding, LawParameter
@@ -24,6 +31,8 @@ from sprung.model.laws.sensor_faults import SENSOR_ERROR, SENSOR_NOISE, SENSOR_S
 from sprung.model.system import System
 from sprung.model.units import confusion
 
+CLOCK_DRIFT = "clock_drift"  # name of the effect
+
 
 def findings_of(outcome: Outcome) -> list[Finding]:
     """Findings, strongest first: stuck channels, then by the reduction of chi-square."""
@@ -32,6 +41,7 @@ def findings_of(outcome: Outcome) -> list[Finding]:
         return [setup_finding(state.system, fault) for fault in state.setup_faults if fault.effect.model_free]
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in state.prepared.stuck]
     ranked += [(np.inf, _contradiction_finding(fault)) for fault in state.contradictions]
+    ranked += [(np.inf, _clock_finding(drift)) for drift in state.clock_drifts if drift.beyond(state.options.rules)]
     ranked += [(np.inf, setup_finding(state.system, f)) for f in state.setup_faults]
     ranked += [
         (f.score, _input_finding(state.system, f)) for f in state.input_faults if not within_tolerance(state, f.term)
@@ -242,4 +252,23 @@ def _contradiction_finding(fault: Contradiction) -> Finding:
         p_value=None,
         delta_bic=None,
         sentence=f"{fault.location}: the other sensors contradict it; {share}; it was left out of the diagnosis",
+    )
+
+
+def clock_in_words(drift: ClockDrift) -> str:
+    """A drifting clock, in words."""
+    sense, names = "later" if drift.rate > 0 else "earlier", drift.location.replace("|", " and ")
+    rate = f"{1e6 * abs(drift.rate):.3g} +- {1e6 * drift.std:.1g} us every second"
+    return f"{names}: all of them become {sense} by {rate}, as their clock drifts; put right"
+
+
+def _clock_finding(drift: ClockDrift) -> Finding:
+    return Finding(
+        location=drift.location,
+        effect=CLOCK_DRIFT,
+        kind=EffectKind.FAULT,
+        parameters=(LawParameter("rate", drift.rate, drift.std, "1"),),
+        p_value=None,
+        delta_bic=None,
+        sentence=clock_in_words(drift),
     )

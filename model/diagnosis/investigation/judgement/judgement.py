@@ -86,6 +86,7 @@ def _kinds_of_faults(state: Investigation, noisy: tuple[NoiseFault, ...]) -> lis
     kinds = [kind_of(fault.effect) for fault in state.setup_faults]
     kinds += [_kind(state, fault.term, fault.term.law) for fault in state.input_faults]
     kinds += [kind_of(state.fit.point.terms[index].law) for index in faulty(state)]
+    kinds += [EffectKind.FAULT for drift in state.clock_drifts if drift.beyond(state.options.rules)]
     counts = ((SENSOR_STUCK, state.prepared.stuck), (SENSOR_ERROR, state.contradictions), (SENSOR_NOISE, noisy))
     return kinds + [kind_of(law) for law, faults in counts for _ in faults]
 

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.investigation.measurements.error_form import form_of
-from sprung.model.diagnosis.investigation.measurements.floor import leaves_more_than_noise
+from sprung.model.diagnosis.investigation.measurements.floor import is_unexplained, leaves_more_than_noise
 from sprung.model.diagnosis.investigation.state import Contradiction, Investigation
 from sprung.model.diagnosis.record.signals import drifting, transform
 from sprung.model.diagnosis.screening.screen import screen
@@ -34,7 +34,7 @@ def without_contradicted(state: Investigation) -> Investigation | None:
     Sensors of groups whose parity is violated are left out, each once.  Without the faulty one, no more than noise is
     left of the others of its group; to leave out one of these is worse.
     """
-    if state.calibrations is not None or not _is_unexplained(state):
+    if state.calibrations is not None or not is_unexplained(state):
         return None
     for group in violated(state):
         ranked = sorted(((left_out(state, i), i) for i in group), key=lambda one: one[0].fit.chi_square)
@@ -46,13 +46,6 @@ def without_contradicted(state: Investigation) -> Investigation | None:
         if clearly and not leaves_more_than_noise(rest, others):
             return replace(rest, contradictions=(*state.contradictions, _described(state, rest, sensor)))
     return None
-
-
-def _is_unexplained(state: Investigation) -> bool:
-    """Whether candidates are significant, or more than noise is left."""
-    alpha = state.options.rules.acceptance.alpha
-    significant = any(state.last.p_value(one) <= alpha for one in state.last.candidates)
-    return significant or leaves_more_than_noise(state)
 
 
 def violated(state: Investigation) -> list[list[int]]:

@@ -20,7 +20,7 @@ def form_of(
 ) -> str:
     """What the error of a sensor looks like, in words.
 
-    true, shown: what it should show and what it does, (T,), of that unit; others: signals (T,) of other sensors, by name.
+    true, shown: what it should show and what it does, (T,), of that unit; others: other sensors' signals (T,), by name.
     """
     error = shown - true
     level = cut_off(shown)

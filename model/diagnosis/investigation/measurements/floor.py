@@ -26,6 +26,13 @@ def leaves_more_than_noise(state: Investigation, of: Sequence[str] | None = None
     return bool(np.any(errors.unexplained(rules) > 0))
 
 
+def is_unexplained(state: Investigation) -> bool:
+    """Whether candidates are significant, or more than noise is left."""
+    alpha = state.options.rules.acceptance.alpha
+    significant = any(state.last.p_value(one) <= alpha for one in state.last.candidates)
+    return significant or leaves_more_than_noise(state)
+
+
 def leaves_what_sampling_leaves(state: Investigation) -> bool:
     """Whether every sensor errs by no more than sampling makes a perfect model err, however little noise there is.
 

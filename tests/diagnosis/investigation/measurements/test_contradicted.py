@@ -41,8 +41,9 @@ def _hum(shown: FloatArray) -> FloatArray:
     return shown + 0.3 * np.sin(2 * np.pi * 16.7 * TIME[: len(shown)])
 
 
-def _filtered(shown: FloatArray) -> FloatArray:
-    return np.asarray(signal.sosfilt(signal.butter(4, 22, fs=100, output="sos"), shown))
+def _smoothed(shown: FloatArray) -> FloatArray:
+    """By software, forwards and backwards: without any lag."""
+    return np.asarray(signal.sosfiltfilt(signal.butter(3, 14, fs=100, output="sos"), shown))
 
 
 def _loose(shown: FloatArray) -> FloatArray:
@@ -61,9 +62,9 @@ def _loose(shown: FloatArray) -> FloatArray:
         (lambda shown: np.clip(shown, -1.5, 1.5), "it is cut off at 1.5 m/s^2"),
         (lambda shown: shown + 0.04 * shown**2, "most of it at"),
         (_loose, "of the time"),
-        (_filtered, "most of it at"),
+        (_smoothed, "most of it at"),
     ],
-    ids=["tone", "cut off", "curved", "loose", "filtered"],
+    ids=["tone", "cut off", "curved", "loose", "smoothed"],
 )
 def test_the_sensor_is_named_and_no_spring_or_damper(error: Callable[[FloatArray], FloatArray], form: str) -> None:
     report = _report(error, BOGIE)
