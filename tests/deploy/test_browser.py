@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import pytest
 import uvicorn
 
+from sprung.model.diagnosis.report.report import LawParameter
 from sprung.model.system import MANCHESTER, System, load_system
 from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
@@ -547,6 +549,18 @@ def test_a_report_is_read_on_a_phone_and_in_the_dark(report_page: Path, browser:
     assert serious(page) == []
     kept(page, f"report-{width}-{scheme}")
     context.close()
+
+
+def test_findings_with_long_names_fit_a_screen(tmp_path: Path, browser: Any) -> None:
+    """Without it the last column, by how much the runner-up is behind, was beyond the edge."""
+    made = friction_report()
+    drift = LawParameter("p", -0.445, 0.008, "1"), LawParameter("tau", 231.0, 17.0, "s")
+    runner_up = {"runner_up": ("time_varying_stiffness", -2162.0), "runner_up_location": "primary_12r"}
+    found = replace(made.findings[0], effect="time_varying_damping", parameters=drift, **runner_up)  # type: ignore[arg-type]
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.goto(write_report(replace(made, findings=(found,)), load_system(), tmp_path).page.as_uri())
+    assert page.evaluate("[...document.querySelectorAll('.scroll')].map(s => s.scrollWidth - s.clientWidth)[0]") <= 0
+    page.close()
 
 
 LAW = "laws: [{coulomb_friction: {force: {value: 300, std: 1}, smoothing: {value: 0.02, fixed: true}}}]"

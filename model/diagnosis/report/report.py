@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from sprung.model.diagnosis.investigation.verdict import Verdict
 from sprung.model.diagnosis.kinds import EffectKind
 
+READABLE = 1e5  # numbers below it are written out
+
 
 @dataclass(frozen=True, slots=True)
 class ReportedParameter:
@@ -60,7 +62,10 @@ class LawParameter:
         if not math.isfinite(self.std) or self.std <= 0:
             return f"{self.value:.4g}{unit}"
         digits = max(2, math.ceil(math.log10(max(abs(self.value), self.std) / self.std)) + 1)
-        return f"{self.value:.{min(digits, 6)}g} +- {self.std:.2g}{unit}"
+        value, std = f"{self.value:.{min(digits, 6)}g}", f"{self.std:.2g}"
+        if max(abs(self.value), self.std) < READABLE:  # 347 to two digits is 350, which `g` writes as 3.5e+02
+            value, std = (f"{float(text):.0f}" if "e+" in text else text for text in (value, std))
+        return f"{value} +- {std}{unit}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,5 +59,8 @@ def test_a_number_whose_deviation_exceeds_it_is_reported_as_not_determined() -> 
     assert plain(beta)["determined"] is False
     force = LawParameter("yield_force", 63.0, 8.4, "N")
     assert force.words() == "63 +- 8.4 N"
+    lasting = LawParameter("tau", 347.0, 65.0, "s")
+    assert lasting.words() == "350 +- 65 s" and replace(lasting, std=123.0).words() == "350 +- 120 s"
+    assert replace(lasting, value=1.22e6, std=3.4e4, unit="N/m").words() == "1.22e+06 +- 3.4e+04 N/m"
     assert "determined" not in plain(force)
     assert LawParameter("loop_area", 5.0, float("nan"), "J").determined
