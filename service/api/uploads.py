@@ -34,6 +34,7 @@ from sprung.service.upload_room import Share
 CHUNK = 1 << 20
 DECEIVING = re.compile(f"[{CONTROL}{UNSEEN}]")  # characters that a name should not have
 MOST_PARTS = 8
+FIELDS = ("vehicle", "start")  # beside the file
 MOST_FIELD_BYTES = 4096
 LONGEST_BOUNDARY = 70  # RFC 2046
 _VEHICLE: TypeAdapter[str] = TypeAdapter(VehicleId)
@@ -44,6 +45,7 @@ BODY: dict[str, Any] = {
         "multipart/form-data": {
             "schema": {
                 "type": "object",
+                "additionalProperties": False,
                 "required": ["file"],
                 "properties": {
                     "file": {"type": "string", "format": "binary", "description": "its name says its kind"},
@@ -240,6 +242,7 @@ class Form:
         self._part.name = options.get(b"name", b"").decode("utf-8", "replace")
         self._part.is_file = b"filename" in options
         if not self._part.is_file:
+            self._begin_value(self._part.name)
             return
         if self._part.name != "file" or self._target is not None:
             raise ApiProblem(422, "give one file, in the field `file`", [{"field": "file", "detail": "one is needed"}])
@@ -252,6 +255,19 @@ class Form:
         else:
             self._target = open(os.devnull, "wb")  # noqa: SIM115 (closed by `close`)
 
+    def _begin_value(self, name: str) -> None:
+        """A part that is no file: one of the form's fields, once."""
+        if name == "file":
+            raise ApiProblem(
+                422, "file comes without its name (`filename`)", [{"field": "file", "detail": "has no name"}]
+            )
+        if name not in FIELDS:
+            detail = f"is no field of the form; it has file, {', '.join(FIELDS)}"
+            raise ApiProblem(422, f"{name[:40]!r} {detail}", [{"field": name[:40], "detail": detail}])
+        if name in self._values:
+            raise ApiProblem(422, f"the form gives {name} twice", [{"field": name, "detail": "is given twice"}])
+        self._values[name] = bytearray()
+
     def _content(self, data: bytes, start: int, end: int) -> None:
         if self._part.is_file:
             assert self._target is not None
@@ -263,7 +279,7 @@ class Form:
                 self._share.written = self.size
             self._digest.update(memoryview(data)[start:end])
             return
-        value = self._values.setdefault(self._part.name, bytearray())
+        value = self._values[self._part.name]
         value += data[start:end]
         if len(value) > MOST_FIELD_BYTES:
             raise ApiProblem(422, f"the form's field {self._part.name[:40]!r} is too long")

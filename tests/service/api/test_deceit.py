@@ -22,6 +22,27 @@ from tests.service_fakes import make_window
 DECEIVING = ["a\0b", "\x1b[31mred", "a\rb", "\x85", "\u202egnp.exe", "\u2066x", "a\u200bb", "a\u2028b"]
 
 
+@pytest.mark.parametrize("route", ["/recordings", "/diagnose"])
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ([("vehicle", "car-1"), ("vehicle", "7")], "the form gives vehicle twice"),  # it was that of car-17
+        ([("vehcile", "car-17")], "'vehcile' is no field of the form; it has file, vehicle, start"),
+        ([("start", ""), ("start", "1790000000")], "the form gives start twice"),
+        ([("file", "time,car_1l")], "file comes without its name"),
+    ],
+)
+def test_a_form_that_says_something_twice_or_what_nobody_knows_is_refused(
+    client: TestClient, core: Core, route: str, fields: list[tuple[str, str]], told: str
+) -> None:
+    parts = [f'--b\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{text}\r\n' for name, text in fields]
+    file = '--b\r\nContent-Disposition: form-data; name="file"; filename="a.csv"\r\n\r\ntime,car_1l\r\n--b--\r\n'
+    headers = {"content-type": "multipart/form-data; boundary=b"}
+    answer = client.post(route, content="".join([*parts, file]).encode(), headers=headers)
+    assert answer.status_code == 422 and told in answer.json()["detail"]
+    assert client.get("/jobs").json()["jobs"] == [] and not list(core.settings.uploads.glob("*"))
+
+
 @pytest.mark.parametrize("text", [*DECEIVING, "two\nlines"])
 def test_labels_are_one_line_without_hidden_characters(
     core: Core, client: TestClient, system: System, text: str
