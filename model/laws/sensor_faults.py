@@ -109,7 +109,7 @@ _SECOND_ORDER = replace(
     _HIGH_PASS,
     parameters=(
         *_HIGH_PASS.parameters,
-        ParameterSpec("damping_ratio", "1", 0.1, 10.0, "of its two poles; above 1: two corners", lambda seen: 0.7),
+        ParameterSpec("damping_ratio", "1", 0.1, 2.0, "of its two poles; above 1: two corners", lambda seen: 0.7),
     ),
     absent=(0.0, float(np.sqrt(0.5))),
     sentence="shows little below {corner}, as behind a high-pass filter of second order with a damping ratio of "

@@ -56,10 +56,7 @@ def _periodic_motion(forward: Forward, forces: LawForces | None) -> ComplexArray
 
 
 def particular_start(forward: Forward, forces: LawForces | None) -> FloatArray:
-    """State (2n + b + f,) of the particular solution at the first sample; the free state is added to it.
-
-    The states of filters are free ones only.
-    """
+    """State (2n + b + f,) of the particular solution at the first sample; the free state is added to it."""
     plant, grid = forward.plant, forward.part.grid
     q = _periodic_motion(forward, forces)
     polynomial = forward.polynomial[0] + (0.0 if forces is None else forces.motion)
@@ -67,5 +64,4 @@ def particular_start(forward: Forward, forces: LawForces | None) -> FloatArray:
     rate = grid.inverse(1j * grid.omega[:, None] * q)[0] + plant.derivative(polynomial)[0]
     deflections = forward.linear_deflection + (0.0 if forces is None else forces.deflections)
     branches = grid.inverse(plant.structure.branch_forces(deflections, grid.omega))[0]
-    structure = plant.structure
-    return np.concatenate([position, rate, branches, np.zeros(structure.states - structure.moving)])
+    return plant.structure.state(position, rate, branches)

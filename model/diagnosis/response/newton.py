@@ -41,10 +41,11 @@ def newton_step(balance: HarmonicBalance) -> Callable[[FloatArray], FloatArray] 
     if not memoryless:
         return None
     s, step = balance.plant.structure, balance.grid.step / OVERSAMPLING
-    A = s.state_matrix()
-    hold = _first_order_hold(A, s.force_columns(balance.wide), step)
+    moving = slice(s.moving)  # filters of sensors follow the motion
+    A = s.state_matrix()[moving, moving]
+    hold = _first_order_hold(A, s.force_columns(balance.wide)[moving], step)
     memory = _RUN_IN / (step * max(float(np.min(-np.linalg.eigvals(A).real)), 1e-9))
-    rows = s.motion_rows(balance.wide)  # deflections of the ports, then rates
+    rows = s.motion_rows(balance.wide)[:, moving]  # deflections of the ports, then rates
 
     def corrected(force: FloatArray) -> FloatArray:
         d, v = balance.motion(force)

@@ -128,6 +128,10 @@ class Structure:
             at += section.order
         return A
 
+    def state(self, position: FloatArray, rate: FloatArray, branches: FloatArray) -> FloatArray:
+        """State (2n + b + f,) of bodies and branches, with filters that show none of their own free motion."""
+        return np.concatenate([position, rate, branches, np.zeros(self.states - self.moving)])
+
     def padded(self, ports: FloatArray) -> FloatArray:
         """Ports (m, E) over the system's elements, padded by zeros to those of this structure."""
         return np.pad(ports, ((0, 0), (0, len(self.H) - ports.shape[1])))

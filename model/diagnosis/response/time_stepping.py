@@ -92,10 +92,10 @@ def _without_equivalent(term: Term, reach: FloatArray) -> ElementLaw:
 
 
 def _state_at(plant: Plant, forces: LawForces, sample: int) -> FloatArray:
-    """State (2n + b,) at a sample of the periodic response to forces."""
+    """State (2n + b + f,) at a sample of the periodic response to forces."""
     grid = plant.grid
     q, bend = (grid.monomials[sample] @ p for p in (forces.motion, plant.derivative(forces.motion)))
     position = grid.inverse(forces.q)[sample] + q
     rate = grid.inverse(1j * grid.omega[:, None] * forces.q)[sample] + bend
     branches = grid.inverse(plant.structure.branch_forces(forces.deflections, grid.omega))[sample]
-    return np.concatenate([position, rate, branches])
+    return plant.structure.state(position, rate, branches)

@@ -27,8 +27,12 @@ def starts_of(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
     if isinstance(candidate.term.law, StructureLaw):
         return structure_starts(problem, base, candidate)
     starts = [joint_start(problem, base, candidate), *_further_starts(problem, base, candidate)]
-    if _far_from_nominal(problem, base) and candidate.term.law.strengths:  # parameters have absorbed a gross law
-        starts.append(joint_start(problem, base, candidate, nominal=True))
+    if _far_from_nominal(problem, base):  # parameters have absorbed a gross law
+        if candidate.term.law.strengths:
+            starts.append(joint_start(problem, base, candidate, nominal=True))
+        elif candidate.term.law.filters:
+            start = start_of(base, candidate)
+            starts.append(replace(start, theta=np.zeros_like(start.theta)))
     return starts
 
 

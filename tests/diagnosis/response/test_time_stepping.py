@@ -29,3 +29,21 @@ def test_forces_marched_in_time_are_those_of_the_whole_trajectory(
     assert led is not None and led.converged
     difference = marched - led.force
     assert np.std(difference) < 0.02 * np.std(led.force)
+
+
+def test_filters_of_sensors_leave_the_forces_as_they_are() -> None:
+    """They have states of their own, in which nothing that moves takes part."""
+    problem = problem_of(simulate(seed=6))
+    law = Term(find_law("bump_stop"), "secondary", (5e-3, 3e6))
+    behind = Term(find_law("high_pass"), "car_a|bogie_a", (0.1,))
+    bare, filtered = (
+        problem.forward(Point(true_log_ratios(quarter_car()), terms, np.zeros(states)))
+        for terms, states in (((law,), 4), ((law, behind), 6))
+    )
+    force, rest = march_from_rest(bare, np.zeros(4))
+    other, beside = march_from_rest(filtered, np.zeros(6))
+    np.testing.assert_allclose(other, force, atol=1e-6 * float(np.std(force)))
+    np.testing.assert_allclose(beside, [*rest, 0.0, 0.0], atol=1e-9)
+    known, found = bare.law_forces(np.zeros(4)), filtered.law_forces(np.zeros(6))
+    assert known is not None and found is not None
+    np.testing.assert_allclose(found.force, known.force, atol=1e-3 * float(np.std(known.force)))
