@@ -14,7 +14,7 @@ from functools import partial
 from math import inf
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import NoReturn, TypeVar
 
 from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
@@ -40,6 +40,7 @@ from sprung.service.store import open_store
 
 log = logging.getLogger("sprung")
 
+T = TypeVar("T")
 Watch = Callable[[Path, Core], "tuple[OnBatch, Callable[[FeedResult], None]]"]
 
 
@@ -150,13 +151,35 @@ def _limits(settings: Settings, path: Path, speed: float) -> ProcessLimits:
     return replace(limits, seconds=inf, silence_seconds=inf if speed else limits.silence_seconds)
 
 
-def _once_more(feed: Callable[..., FeedResult], *given: Any, **named: Any) -> FeedResult:
+def _once_more(feed: Callable[[], T]) -> T:
     """Again, where the process that read the recording was ended: what is stored already is not stored twice."""
     try:
-        return feed(*given, **named)
+        return feed()
     except WorkerKilled as error:
         log.error("%s; it is tried once more", error)
-        return feed(*given, **named)
+        return feed()
+
+
+def _feed_file(
+    core: Core, feeds: Feeds, path: Path, recording_id: str, watch: Watch, check: Callable[[], None]
+) -> tuple[FeedResult, Callable[[FeedResult], None]]:
+    """What became of a file, and who is told at the end."""
+    on_batch, on_end = watch(path, core)
+    fed = feed_file(
+        core.pipeline,
+        path,
+        vehicle=feeds.vehicle,
+        recording_id=recording_id,
+        batch_windows=core.settings.batch_windows,
+        speed=feeds.speed,
+        limits=_limits(core.settings, path, feeds.speed),
+        start=feeds.start,
+        on_batch=on_batch,
+        on_tally=core.tally_counter("file"),
+        check=check,
+        retrying=True,
+    )
+    return fed, on_end
 
 
 def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
@@ -165,25 +188,10 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
             raise Interrupted
 
     for path in feeds.files:
-        on_batch, on_end = watch(path, core)
         try:
             row = file_row(path, feeds.start)
             retry(partial(add_row, core.store, row), path.name, check)
-            fed = _once_more(
-                feed_file,
-                core.pipeline,
-                path,
-                vehicle=feeds.vehicle,
-                recording_id=row.id,
-                batch_windows=core.settings.batch_windows,
-                speed=feeds.speed,
-                limits=_limits(core.settings, path, feeds.speed),
-                start=feeds.start,
-                on_batch=on_batch,
-                on_tally=core.tally_counter("file"),
-                check=check,
-                retrying=True,
-            )
+            fed, on_end = _once_more(partial(_feed_file, core, feeds, path, row.id, watch, check))
             retry(partial(finish_row, core.store, row, fed), path.name, check)
             on_end(fed)
         except Interrupted:
