@@ -11,6 +11,8 @@ from sprung.model.signals import FloatArray
 
 _REPEATED, _CROWDED = 5, 3.0  # samples at an extreme value, and times as many as at the next one
 _TONE, _OF_TONE = 2, 0.8  # bins beside its own, that a tone leaks into, and its share of the power beyond the noise
+_OFFSET = 0.5  # of an error's power
+_PERIODS = 5  # of a tone within the record, at least
 _COPY = 0.9  # correlation with another signal
 _BRIEF = 0.1  # of the samples, in which most of the power is
 
@@ -26,6 +28,9 @@ def form_of(
     level = cut_off(shown)
     if level is not None:
         return f"it is cut off at {level:.3g} {unit}"
+    offset = float(np.mean(error))
+    if offset**2 > _OFFSET * np.mean(error**2):
+        return f"off by {offset:.2g} {unit}"
     tone = _tone(error, sample_rate)
     if tone is not None:
         return f"a tone at {tone[0]:.3g} Hz of {tone[1]:.2g} {unit}"
@@ -60,7 +65,7 @@ def _tone(error: FloatArray, sample_rate: float) -> tuple[float, float] | None:
     peak = int(np.argmax(power))
     near = power[max(0, peak - _TONE) : peak + _TONE + 1]
     of_tone, beyond = float(np.sum(near - noise)), float(np.sum(power - noise))
-    if of_tone < _OF_TONE * beyond or of_tone < _OF_TONE * noise * len(power) ** 0.5:
+    if peak + 1 < _PERIODS or of_tone < _OF_TONE * beyond or of_tone < _OF_TONE * noise * len(power) ** 0.5:
         return None
     amplitude = np.sqrt(of_tone / 6) * 8 / len(error)  # of Hann's window: 6 = (2^2 + 1 + 1), half its height is 1/4
     return (peak + 1) * sample_rate / len(error), float(amplitude)

@@ -30,7 +30,8 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     white = upper_ratio(state, known) > 1 + rules.white * (inside - 1)
     inaccuracy = rules.inaccuracy * np.mean((after.simulated - before.simulated) ** 2, axis=0)
     white &= (inside**2 - np.median(inside) ** 2) * known**2 > inaccuracy
-    white &= is_what_is_left(noise.sensors**2, np.mean((after.measured - after.simulated) ** 2, axis=0), rules)
+    error = np.mean((after.measured - after.simulated) ** 2, axis=0)
+    white &= is_what_is_left(noise.sensors**2, error, rules) | is_what_is_left(later_power(state), error, rules)
     found += outliers(names, inside, white, count, rules)
     pairs = state.problem.part.pairs
     if len(pairs):
@@ -84,6 +85,14 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
         power = np.minimum(power, np.mean(np.abs(beyond) ** 2, axis=0))
     found: np.ndarray = np.sqrt(np.maximum(power - through, 0.0)) / declared
     return found
+
+
+def later_power(state: Investigation) -> np.ndarray:
+    """Power of the sensors above the compared band in the held-out part, per sample, (S,): noise may begin in it."""
+    grid, upper = state.held.later.grid, state.options.rules.noise.upper
+    beyond = state.held.later.sensors[grid.band.stop : int(upper * grid.samples)]
+    few = len(beyond) < state.options.rules.noise.bins
+    return np.zeros(beyond.shape[1]) if few else np.asarray(np.mean(np.abs(beyond) ** 2, axis=0))
 
 
 def outliers(

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.misfit import misfit
-from sprung.model.diagnosis.investigation.measurements.excess_noise import upper_ratio
+from sprung.model.diagnosis.investigation.measurements.excess_noise import later_power, upper_ratio
 from sprung.model.diagnosis.investigation.state import Investigation, NoiseFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
@@ -55,7 +55,8 @@ def bounded(state: Investigation, noisy: Sequence[NoiseFault] = ()) -> Noise:
     """Noise levels for the floor: estimated ones, at most as declared or observed above the compared band.
 
     Friction, stops and what a rig is driven with move sensors there, too: what a file declares is believed to be wrong
-    by a slip of ten, and not by more.  noisy: sensors with a noise that only their peers speak against.
+    by a slip of ten, and not by more.  noisy: sensors with a noise that only their peers speak against; it may
+    have begun in the held-out part.
     """
     prepared, rules = state.prepared.signals, state.options.rules
     declared = declared_noise(state.system, prepared, rules)
@@ -63,10 +64,11 @@ def bounded(state: Investigation, noisy: Sequence[NoiseFault] = ()) -> Noise:
     known = declared.sensors[present]
     seen = upper_ratio(state, known)
     seen = np.where(np.isfinite(seen), seen, 0.0)
-    bound = _declares(state, {fault.location for fault in noisy})
-    seen = np.where(bound, np.minimum(seen, rules.noise.misdeclared), seen) * known
+    apart = {fault.location for fault in noisy}
+    seen = np.where(_declares(state, apart), np.minimum(seen, rules.noise.misdeclared), seen) * known
     noise, slack = state.problem.noise, rules.verdict.slack
-    sensors = bounded_noise(noise.sensors, known, seen, slack)
+    began = np.where([name in apart for name in state.signals.sensor_names], np.sqrt(later_power(state)), 0.0)
+    sensors = bounded_noise(np.maximum(noise.sensors, began), known, np.maximum(seen, began), slack)
     force = bounded_noise(noise.force, declared.force, np.zeros(len(noise.force)), slack)
     return replace(noise, sensors=sensors, force=force)
 

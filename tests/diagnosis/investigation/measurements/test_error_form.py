@@ -32,6 +32,15 @@ def test_noise_is_no_tone_and_no_copy() -> None:
     assert form.startswith("most of it at")
 
 
+def test_a_step_or_a_drift_is_no_tone() -> None:
+    for error in (0.3 * (TIME > 9) - 0.15, 0.2 * (TIME / 18) ** 2 - 0.07):
+        assert _form(error + NOISE).startswith("most of it at")
+
+
+def test_an_offset_is_told() -> None:
+    assert _form(-0.25 + NOISE) == "off by -0.25 m/s^2"
+
+
 def test_a_copy_is_told_with_the_nearest_source() -> None:
     others = {"near": MOTION, "far": MOTION + 3 * RANDOM.standard_normal(1800)}
     assert _form(-0.2 * MOTION + 0.1 * NOISE, others, true=OTHER_MOTION) == "-0.2 times what near shows"

@@ -22,7 +22,7 @@ from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import load_system
-from tests.diagnosis_cases import MadeRecord
+from tests.diagnosis_cases import MadeRecord, quarter_car, simulate
 
 NAMES = ["a", "b", "c", "d", "e"]
 EVERY = np.ones(5, dtype=bool)
@@ -133,3 +133,14 @@ def test_motions_without_noise_are_no_faulty_channels() -> None:
     shown = road + rng.standard_normal(road.shape) * [channel.noise for channel in system.inputs]
     state = begun(system, MadeRecord(np.column_stack([shown, sensors])), Options(), lambda share, what: None)
     assert reaching_sensors(state).all()
+
+
+@pytest.mark.parametrize(("begins", "level"), [(1000, 0.06), (1250, 0.1), (1250, 0.2)])
+def test_noise_that_begins_on_the_way_is_neither_part_of_an_all_clear_nor_physics(begins: int, level: float) -> None:
+    record = simulate(seed=76)
+    record.values[begins:, 4] += level * np.random.default_rng(1).standard_normal(len(record.values) - begins)
+    report = diagnose(quarter_car(), record)
+    assert (report.verdict, [(f.location, f.effect) for f in report.findings]) == (
+        "sensor_fault",
+        [(quarter_car().channels[4].name, "sensor_noise")],
+    )
