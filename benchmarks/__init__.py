@@ -64,6 +64,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "sprung.benchmarks.setups",
         "wrong set-ups on simulated recordings: signs, channels, nodes, scales, positions, bodies",
     ),
+    "sensor-errors": (
+        "sprung.benchmarks.sensor_errors",
+        "errors of sensors that are in no list, with and without concealed physics beside them",
+    ),
     "setup-rigs": ("sprung.benchmarks.setup_rigs", "wrong set-ups of rigs that are no train"),
     "cars": ("sprung.benchmarks.cars", "what cars do that their files leave out"),
     "naming": (

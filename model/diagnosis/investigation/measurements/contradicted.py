@@ -51,8 +51,8 @@ def without_contradicted(state: Investigation) -> Investigation | None:
 def violated(state: Investigation) -> list[list[int]]:
     """Groups of sensors whose parity is violated, as positions among the present sensors.
 
-    That is by more than their noise, as declared and with a margin, and than sampling leaves of a perfect model, in the
-    mean or in a single bin.
+    That is by more than their noise, as declared and with a margin, and than sampling leaves of a perfect model, in a
+    stretch of the spectrum or in a single bin.
     """
     part, rules = state.problem.part, state.options.rules.verdict
     shown = part.sensors[part.grid.band][1:]
@@ -66,7 +66,8 @@ def violated(state: Investigation) -> list[list[int]]:
         for group, parity in parity_groups(mechanics.S[sensors[alike]] / level[alike, None]):
             members = alike[group]
             power = np.mean(np.abs((shown[:, members] / level[members]) @ parity) ** 2, axis=1)
-            found += [members.tolist()] if np.mean(power) > 1 or np.max(power) > by_chance else []
+            of_stretches = [np.mean(stretch) for stretch in np.array_split(power, state.options.rules.report.stretches)]
+            found += [members.tolist()] if max(of_stretches) > 1 or np.max(power) > by_chance else []
     return found
 
 
