@@ -29,7 +29,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from sprung.service.processes.worker import START_SECONDS, Tether, tie, without_program
+from sprung.service.processes.worker import START_SECONDS, Tether, go_before_others, tie, without_program
 
 if sys.platform == "linux":
     import fcntl
@@ -38,10 +38,10 @@ log = logging.getLogger("sprung")
 END_SECONDS = 2.0
 PIPE_BYTES = 1 << 20  # of answers that wait to be taken: a vehicle's tracker is 130 kB
 LOOK_SECONDS = 1.0  # between two looks at a process
+OOM_SCORE = 500  # the service goes on without it; processes that read files of strangers go first
 STOPPED_SECONDS = 10.0  # by a signal, after which it is replaced
-IDLE_SECONDS = (
-    60.0  # of a process that is asked and neither runs nor waits for the disk: its threads wait for each other
-)
+# of a process that is asked and neither runs nor waits for the disk: its threads wait for each other
+IDLE_SECONDS = 60.0
 PAUSES = (1.0, 60.0)  # s, the first and the longest between two processes that do not last
 LASTING_SECONDS = 60.0  # after which a process has lasted
 
@@ -383,6 +383,7 @@ def _spawned(_parent: object, pickled: bytes, asked: Connection, answer: Connect
 def _work(given: _Given, asked: Connection, answer: Connection, announced: bool = False) -> None:
     """Answer what is asked, for as long as there is somebody who may ask.  announced: it is said when this begins."""
     functions, begin = given
+    go_before_others(OOM_SCORE)
     for told_all in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and service managers tell the whole group; the parent,
         signal.signal(told_all, signal.SIG_IGN)  # which finishes what it accepted, decides
     if begin is not None:

@@ -285,12 +285,17 @@ def carried_out(task: Task[Request, None, Result], request: Request, limits: Pro
     return worker.result
 
 
+def go_before_others(score: int) -> None:
+    """Let the kernel end this process, rather than the service, when memory runs out; score: up to 1000, the first."""
+    with suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as target:
+        target.write(str(score))
+
+
 def be_modest(limits: ProcessLimits) -> None:
     """Low priority, first to go when memory runs out, and bounds of the kernel's where the platform has them."""
     with suppress(OSError, AttributeError):
         os.nice(limits.niceness)
-    with suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as target:
-        target.write("900")
+    go_before_others(900)
     with suppress(ImportError, ValueError, OSError):
         import resource
 

@@ -94,6 +94,12 @@ def test_functions_run_in_another_process(doubling: ForkedFunctions) -> None:
     assert doubling.call("pid") == doubling.pid != os.getpid()
 
 
+def test_it_goes_before_the_service_when_memory_runs_out(doubling: ForkedFunctions) -> None:
+    assert doubling.call("double", 1) == 2  # it has begun
+    score = Path(f"/proc/{doubling.pid}/oom_score_adj").read_text()
+    assert int(score) > int(Path("/proc/self/oom_score_adj").read_text())
+
+
 def test_what_a_function_raises_is_raised_here(doubling: ForkedFunctions) -> None:
     with pytest.raises(UnusableWindow, match="a negative one"):
         doubling.call("double", -1)
