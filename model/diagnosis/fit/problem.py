@@ -7,7 +7,7 @@ with G from the measured inputs to the sensors and S_u the inputs' noise (`white
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -72,6 +72,12 @@ class Problem:
         return Forward(
             self.system, part, self.sensors, point.theta, point.terms, point.warm_start, known, self.newton_allowed
         )
+
+    def with_filters_anew(self, point: Point) -> Point:
+        """A point with the states that the filters of its terms have here, which begin at none."""
+        structure = self.forward(point).plant.structure
+        state = np.pad(point.state[: structure.moving], (0, structure.states - structure.moving))
+        return replace(point, state=state)
 
     def predict(
         self, point: Point, inputs: SmoothedInputs | None = None, known: Plant | None = None

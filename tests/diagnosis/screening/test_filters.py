@@ -42,14 +42,16 @@ def resonance(frequency: float, ratio: float) -> Response:
     return lambda f: np.asarray(1 / (1 + 2 * ratio * 1j * f / frequency - (f / frequency) ** 2))
 
 
-def behind(response: Response, names: tuple[str, ...], seconds: float = 30.0, seed: int = 31) -> MadeRecord:
+def behind(
+    response: Response, names: tuple[str, ...], seconds: float = 30.0, seed: int = 31, noise: float = 1.0
+) -> MadeRecord:
     """The middle of a longer ride, whose accelerometers show it behind a filter; noise comes after."""
     before = 15.0
     values = simulate(seconds=seconds + 2 * before, seed=seed, noise=0.0).values
     for name in names:
         column = 2 + ALL.index(name)
         values[:, column] = through(values[:, column], response)
-    values += np.random.default_rng([seed, 1]).standard_normal(values.shape) * NOISE
+    values += noise * np.random.default_rng([seed, 1]).standard_normal(values.shape) * NOISE
     return MadeRecord(values[int(before * 100) : int((before + seconds) * 100)])
 
 
@@ -103,6 +105,28 @@ def test_a_hung_mass_stays_one_beside_a_high_pass_filter() -> None:
         (part.location, "suspended_mass"),
         (HALF.sensors[0], "high_pass"),
     }, report.summary
+
+
+def test_accelerometers_with_corners_of_their_own_are_no_physics() -> None:
+    """One of them is left out, as the others contradict it, while they share a filter with it."""
+    record = behind(high_pass(0.08), ALL[:1], noise=0.0)
+    for name, corner in zip(ALL[1:], (0.1, 0.12, 0.15), strict=True):
+        column = 2 + ALL.index(name)
+        record.values[:, column] = behind(high_pass(corner), (name,), noise=0.0).values[:, column]
+    record.values[:] += np.random.default_rng(5).standard_normal(record.values.shape) * NOISE
+    report = diagnose(quarter_car(), record)
+    assert report.verdict == "sensor_fault", report.summary
+    assert {place for finding in report.findings for place in finding.location.split("|")} <= set(ALL)
+
+
+def test_a_sensor_with_a_declared_filter_can_be_left_out() -> None:
+    place = "bogie_b: {kind: acceleration, "
+    assert QUARTER_CAR.count(place) == 1
+    declared = parse_system(QUARTER_CAR.replace(place, place + "laws: [{high_pass: {corner: 0.1}}], "))
+    record = behind(high_pass(0.1), ALL[3:])
+    record.values[:, 5] += 0.05 * record.values[:, 5] ** 3  # a curved characteristic
+    report = diagnose(declared, record)
+    assert report.verdict == "sensor_fault" and [f.location for f in report.findings] == ["bogie_b"], report.summary
 
 
 @pytest.mark.parametrize("seed", [41, 42, 43])

@@ -110,7 +110,7 @@ def left_out(state: Investigation, sensor: int) -> Investigation:
     part = transform(first, noise, state.options.rules.record, differentiated=differentiated)
     problem = replace(state.problem, part=part, sensors=signals.sensor_index, noise=noise)
     terms = tuple(term for term in state.fit.point.terms if term.location != name)
-    start = replace(state.fit.point, warm_start=(), terms=terms)
+    start = problem.with_filters_anew(replace(state.fit.point, warm_start=(), terms=terms))
     return replace(
         state,
         signals=signals,
@@ -129,7 +129,9 @@ def screened_anew(state: Investigation, base: Investigation) -> Investigation:
     """
     fit = state.fit
     if state.found:
-        start = replace(base.base.point, warm_start=())
+        out = {*base.signals.sensor_names} - {*state.signals.sensor_names}
+        given = tuple(term for term in base.base.point.terms if term.location not in out)
+        start = state.problem.with_filters_anew(replace(base.base.point, warm_start=(), terms=given))
         fit = settled(state.problem, optimise(state.problem, start, state.options.rules.fit.restarted))
     screening = screen(state.problem, state.fit, state.system.catalogue, state.options.project)
     return replace(state, base=fit, first=screening, last=screening)
@@ -137,7 +139,7 @@ def screened_anew(state: Investigation, base: Investigation) -> Investigation:
 
 def _described(state: Investigation, rest: Investigation, sensor: int) -> Contradiction:
     """What a sensor shows beside the motion by the model that was identified without it."""
-    run = state.held.run(rest.fit.point)
+    run = state.held.run(state.problem.with_filters_anew(rest.fit.point))
     name = state.signals.sensor_names[sensor]
     unit = next(channel.unit for channel in state.system.channels if channel.name == name)
     others = dict(zip(rest.signals.sensor_names, rest.signals.sensors[state.held.split :].T, strict=True))
