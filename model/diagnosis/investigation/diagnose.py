@@ -9,7 +9,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
-from sprung.model.diagnosis.investigation.configuration.effects import Hypothesis
+from sprung.model.diagnosis.investigation.configuration.effects import SENSOR_POSITION, Hypothesis
 from sprung.model.diagnosis.investigation.configuration.fitted import FittedSetup
 from sprung.model.diagnosis.investigation.configuration.search import without_setup_faults
 from sprung.model.diagnosis.investigation.judgement.judgement import (
@@ -28,8 +28,10 @@ from sprung.model.diagnosis.investigation.judgement.significance import (
 from sprung.model.diagnosis.investigation.measurements.clock_drift import without_clock_drift
 from sprung.model.diagnosis.investigation.measurements.common_delay import common_delay
 from sprung.model.diagnosis.investigation.measurements.contradicted import (
+    is_compared,
     screened_anew,
     without_contradicted,
+    without_misplaced,
 )
 from sprung.model.diagnosis.investigation.measurements.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.measurements.floor import leaves_more_than_noise
@@ -101,10 +103,9 @@ def _with_several(state: Investigation, progress: Progress) -> Investigation | N
 
 def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
     """Findings one after the other, until the residual is noise."""
-    # the residual of an estimated delay, scale or position is not searched for unmodelled dynamics
-    state = state if state.only else without_clock_drift(state) or state
-    uncertain, notes = any(fault.value is not None for fault in state.setup_faults), state.notes
-    for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
+    state = without_misplaced(state if state.only else without_clock_drift(state) or state)
+    notes, most = state.notes, 0 if _is_uncertain(state) else state.options.rules.acceptance.findings
+    for number in range(len(state.found), most):
         rest = None if state.only else without_contradicted(state)
         if rest is not None:
             return _beside_contradicted(state, rest, progress)
@@ -125,12 +126,17 @@ def _one_by_one(state: Investigation, progress: Progress) -> Investigation:
     return state
 
 
+def _is_uncertain(state: Investigation) -> bool:
+    """Whether an estimated delay, scale or position remains, whose residual is not searched for unmodelled dynamics."""
+    estimated = [fault for fault in state.setup_faults if fault.value is not None]
+    return any(fault.effect is not SENSOR_POSITION or is_compared(state, fault) for fault in estimated)
+
+
 def _beside_contradicted(state: Investigation, rest: Investigation, progress: Progress) -> Investigation:
     """Findings beside a contradicted sensor: a fault of it if that leaves nothing unexplained; else without it.
 
-    Of several faults of one sensor, one takes up what another lacks, and so do springs and dampers.
-
-    rest: the investigation without the sensor.
+    Of several faults of one sensor, one takes up what another lacks, and so do springs and dampers.  rest: the
+    investigation without the sensor.
     """
     sensor = rest.contradictions[-1].location
     progress(share_done(len(state.found)), f"the other sensors contradict {sensor}")

@@ -9,6 +9,7 @@ others of its group show no more than noise.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from scipy.sparse.csgraph import connected_components
 
 from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.optimise import optimise
+from sprung.model.diagnosis.investigation.configuration.effects import SENSOR_POSITION
+from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
 from sprung.model.diagnosis.investigation.measurements.error_form import form_of
 from sprung.model.diagnosis.investigation.measurements.floor import is_unexplained, leaves_more_than_noise
 from sprung.model.diagnosis.investigation.state import Contradiction, Investigation
@@ -39,13 +42,31 @@ def without_contradicted(state: Investigation) -> Investigation | None:
     for group in violated(state):
         ranked = sorted(((left_out(state, i), i) for i in group), key=lambda one: one[0].fit.chi_square)
         (rest, sensor), (second, _) = ranked[:2]
-        problem, fit = refreshed(rest.problem, rest.fit)
         clearly = second.fit.chi_square - rest.fit.chi_square > state.options.rules.acceptance.isolated
-        rest = replace(rest, problem=problem, fit=fit, held=replace(rest.held, noise=problem.noise))
+        rest = _with_noise(rest)
         others = [state.signals.sensor_names[i] for i in group if i != sensor]
         if clearly and not leaves_more_than_noise(rest, others):
             return replace(rest, contradictions=(*state.contradictions, _described(state, rest, sensor)))
     return None
+
+
+def without_misplaced(state: Investigation) -> Investigation:
+    """The investigation without sensors that sit elsewhere than the file says, where others show the same motion.
+
+    What their estimated positions leave would hide unmodelled dynamics, or be taken for it.
+    """
+    for fault in state.setup_faults:
+        if fault.effect is not SENSOR_POSITION or not is_compared(state, fault):
+            continue
+        sensor = state.signals.sensor_names.index(fault.site.location)
+        if any(sensor in members for members, _, _ in _groups(state)):
+            state = screened_anew(_with_noise(left_out(state, sensor)), state)
+    return state
+
+
+def is_compared(state: Investigation, fault: SetupFault) -> bool:
+    """Whether the sensor of a fault of the set-up is among those that are compared."""
+    return fault.site.location in state.signals.sensor_names
 
 
 def violated(state: Investigation) -> list[list[int]]:
@@ -54,21 +75,29 @@ def violated(state: Investigation) -> list[list[int]]:
     That is by more than their noise, as declared and with a margin, and than sampling leaves of a perfect model, in a
     stretch of the spectrum or in a single bin.
     """
-    part, rules = state.problem.part, state.options.rules.verdict
+    part, rules = state.problem.part, state.options.rules
     shown = part.sensors[part.grid.band][1:]
-    size = np.sqrt(np.mean(np.abs(shown) ** 2, axis=0))
-    level = np.hypot(rules.slack * state.declared.sensors, rules.least * size)
-    by_chance = float(np.log(len(shown) / state.options.rules.acceptance.alpha))  # of the largest of exponential powers
-    mechanics, sensors = state.system.mechanics, state.signals.sensor_index
+    by_chance = float(np.log(len(shown) / rules.acceptance.alpha))  # of the largest of exponential powers
     found: list[list[int]] = []
+    for members, level, parity in _groups(state):
+        power = np.mean(np.abs((shown[:, members] / level) @ parity) ** 2, axis=1)
+        of_stretches = [np.mean(stretch) for stretch in np.array_split(power, rules.report.stretches)]
+        found += [members] if max(of_stretches) > 1 or np.max(power) > by_chance else []
+    return found
+
+
+def _groups(state: Investigation) -> Iterator[tuple[list[int], FloatArray, FloatArray]]:
+    """Groups of sensors with a parity space: positions (m,), largest level of what is none of the motion (m,), and a
+    basis of the space in units of it, (m, r)."""
+    part, rules = state.problem.part, state.options.rules.verdict
+    size = np.sqrt(np.mean(np.abs(part.sensors[part.grid.band][1:]) ** 2, axis=0))
+    level = np.hypot(rules.slack * state.declared.sensors, rules.least * size)
+    mechanics, sensors = state.system.mechanics, state.signals.sensor_index
     for kind in (ACCELERATION, VELOCITY, DISPLACEMENT):
         alike = np.flatnonzero(mechanics.sensor_kind[sensors] == kind)
         for group, parity in parity_groups(mechanics.S[sensors[alike]] / level[alike, None]):
             members = alike[group]
-            power = np.mean(np.abs((shown[:, members] / level[members]) @ parity) ** 2, axis=1)
-            of_stretches = [np.mean(stretch) for stretch in np.array_split(power, state.options.rules.report.stretches)]
-            found += [members.tolist()] if max(of_stretches) > 1 or np.max(power) > by_chance else []
-    return found
+            yield members.tolist(), level[members], parity
 
 
 def parity_groups(rows: FloatArray) -> list[tuple[np.ndarray, FloatArray]]:
@@ -120,6 +149,12 @@ def left_out(state: Investigation, sensor: int) -> Investigation:
         held=replace(state.held, signals=signals, noise=noise),
         found=tuple(one for one in state.found if one.trial.term.location != name),
     )
+
+
+def _with_noise(state: Investigation) -> Investigation:
+    """An investigation with noise levels estimated anew, also for its held-out part."""
+    problem, fit = refreshed(state.problem, state.fit)
+    return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise))
 
 
 def screened_anew(state: Investigation, base: Investigation) -> Investigation:
