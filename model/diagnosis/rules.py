@@ -280,7 +280,7 @@ class AcceptanceRules:
     most_left: float = rule(0.5, "of the unmeasured forces that earlier findings left; chosen", 0.3, 0.8)
     diverged: float = rule(1.5, "rise of the reduced chi-square on the whole recording; chosen", 1.2, 3.0)
     isolated: float = rule(
-        30.0, "chi-square by which leaving out any other sensor of a group is worse; derived: no chance", 15.0, 60.0
+        6.0, "deviations of chi-square by which leaving out another sensor is worse; derived: no chance", 4.0, 10.0
     )
     steady: float = rule(6.0, "deviations of a clock's rate, of eight segments; derived: no chance", 4.0, 10.0)
     clock_rounds: int = rule(4, "in which a clock's rate is estimated; chosen", 2, 6)

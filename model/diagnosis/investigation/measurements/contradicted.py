@@ -39,10 +39,13 @@ def without_contradicted(state: Investigation) -> Investigation | None:
     """
     if state.calibrations is not None or not is_unexplained(state):
         return None
+    rules = state.options.rules.acceptance
     for group in violated(state):
         ranked = sorted(((left_out(state, i), i) for i in group), key=lambda one: one[0].fit.chi_square)
         (rest, sensor), (second, _) = ranked[:2]
-        clearly = second.fit.chi_square - rest.fit.chi_square > state.options.rules.acceptance.isolated
+        # left-out sensors differ in their own noise, too, of twice as many degrees of freedom as bins
+        by_chance = np.sqrt(8 * len(rest.problem.part.grid.omega[rest.problem.part.grid.band])) * rest.fit.reduced
+        clearly = second.fit.chi_square - rest.fit.chi_square > rules.isolated * by_chance
         rest = _with_noise(rest)
         others = [state.signals.sensor_names[i] for i in group if i != sensor]
         if clearly and not leaves_more_than_noise(rest, others):
@@ -72,26 +75,31 @@ def is_compared(state: Investigation, fault: SetupFault) -> bool:
 def violated(state: Investigation) -> list[list[int]]:
     """Groups of sensors whose parity is violated, as positions among the present sensors.
 
-    That is by more than their noise, as declared and with a margin, and than sampling leaves of a perfect model, in a
-    stretch of the spectrum or in a single bin.
+    That is by more than their noise, as declared and with a margin, and than gains within their data sheets make of
+    what they show, in a stretch of the spectrum or in a single bin.
     """
     part, rules = state.problem.part, state.options.rules
     shown = part.sensors[part.grid.band][1:]
+    sheets = state.system.tolerances[-len(state.system.sensors) :]
+    gains = np.array([sheets[index].gain for index in state.signals.sensor_index])
+    off = np.hypot(rules.plausible.calibration * gains, rules.verdict.least) * np.abs(shown)
     by_chance = float(np.log(len(shown) / rules.acceptance.alpha))  # of the largest of exponential powers
     found: list[list[int]] = []
     for members, level, parity in _groups(state):
-        power = np.mean(np.abs((shown[:, members] / level) @ parity) ** 2, axis=1)
+        leak = (off[:, members] / level) ** 2 @ parity**2
+        power = np.mean(np.abs((shown[:, members] / level) @ parity) ** 2 / (1 + leak), axis=1)
         of_stretches = [np.mean(stretch) for stretch in np.array_split(power, rules.report.stretches)]
         found += [members] if max(of_stretches) > 1 or np.max(power) > by_chance else []
     return found
 
 
 def _groups(state: Investigation) -> Iterator[tuple[list[int], FloatArray, FloatArray]]:
-    """Groups of sensors with a parity space: positions (m,), largest level of what is none of the motion (m,), and a
-    basis of the space in units of it, (m, r)."""
-    part, rules = state.problem.part, state.options.rules.verdict
-    size = np.sqrt(np.mean(np.abs(part.sensors[part.grid.band][1:]) ** 2, axis=0))
-    level = np.hypot(rules.slack * state.declared.sensors, rules.least * size)
+    """Groups of sensors with a parity space: positions (m,), noise (m,), a basis of the space in units of it, (m, r).
+
+    Noise is as declared, with a margin, and times what most sensors have more of it than declared.
+    """
+    usual = float(np.median(state.problem.noise.sensors / state.declared.sensors))
+    level = state.options.rules.verdict.slack * max(1.0, usual) * state.declared.sensors
     mechanics, sensors = state.system.mechanics, state.signals.sensor_index
     for kind in (ACCELERATION, VELOCITY, DISPLACEMENT):
         alike = np.flatnonzero(mechanics.sensor_kind[sensors] == kind)
