@@ -114,9 +114,7 @@ class ForkedFunctions:
         self._asked_since: float | None = None  # monotonic s, of what is sent or waited for
         self._closing = threading.Event()
         context = multiprocessing.get_context("fork")
-        asked, ask = context.Pipe(duplex=False)
-        answers, answer = context.Pipe(duplex=False)
-        _widen(answer)
+        asked, ask, answers, answer = _pipes()
         process = context.Process(
             target=_forked,
             args=(os.getpid(), (functions, begin), (ask, answers), asked, answer),
@@ -254,9 +252,7 @@ class ForkedFunctions:
         if self._closing.is_set():
             return
         context = multiprocessing.get_context("spawn")
-        asked, ask = context.Pipe(duplex=False)
-        answers, answer = context.Pipe(duplex=False)
-        _widen(answer)
+        asked, ask, answers, answer = _pipes()
         process = context.Process(
             target=_spawned,
             args=(Tether(os.getpid()), self._given, asked, answer),  # the tether first: see there
@@ -357,6 +353,14 @@ def _threads_of(pid: int) -> tuple[set[str], int]:
             states.add(fields[0])
             ticks += int(fields[11]) + int(fields[12])
     return states, ticks
+
+
+def _pipes() -> tuple[Connection, Connection, Connection, Connection]:
+    """Two pipes to another process, for what is asked and what is answered, each by its ends to read and to write."""
+    asked, ask = multiprocessing.Pipe(duplex=False)
+    answers, answer = multiprocessing.Pipe(duplex=False)
+    _widen(answer)
+    return asked, ask, answers, answer
 
 
 def _widen(pipe: Connection) -> None:
