@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,22 +23,14 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
-from sprung.benchmarks.setups import in_order
+from sprung.benchmarks.setups import RATE, FalsifiedRecording, in_order, sensors_on
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.kinds import EffectKind
-from sprung.model.schema import MotionSensor
 from sprung.model.system import MANCHESTER, System, load_system
 
 Array = NDArray[np.float64]
-SECONDS, RATE = 40.0, 100.0
+SECONDS = 40.0
 EFFECTS = ["coulomb_friction", "bump_stop", "series_stiffness", "damper_blowoff", "mass_change"]
-
-
-@dataclass(frozen=True)
-class _Falsified:
-    values: Array
-    sample_rate: float = RATE
-    lost: int = 0
 
 
 def _hum(shown: Array, other: Array, random: np.random.Generator) -> Array:
@@ -119,23 +110,23 @@ def run(count: int = 60, seed: int = 1, first: int = 0) -> Iterator[dict[str, An
         if number < first:
             continue
         random, kind = np.random.default_rng([seed, number]), KINDS[number // 2 % len(KINDS)]
-        values, channels = falsified(system, in_order(system, made.values), kind, random)
+        wrong = falsified(system, in_order(system, made.values), kind, random)
         began = time.process_time()
-        report = diagnose(system, _Falsified(values), Options(file=f"{kind}-{number}"))
+        report = diagnose(system, wrong, Options(file=f"{kind}-{number}"))
         faults = {name for f in report.findings if f.kind is EffectKind.FAULT for name in f.location.split("|")}
-        if kind == CLOCK and any("clock" in note for note in report.advice):
-            faults |= {name for name in channels if any(name in note for note in report.advice if "clock" in note)}
+        if kind == CLOCK:  # an ordinary drift is told as a note
+            faults |= {name for note in report.advice if "clock" in note for name in wrong.channels if name in note}
         physics = {(f.location, f.effect) for f in report.findings if f.kind is not EffectKind.FAULT}
         truth = {(f["location"], f["effect"]) for f in made.case.findings()}
         line = {
             "number": number,
             "error": kind,
-            "channels": sorted(channels),
+            "channels": sorted(wrong.channels),
             "snr": made.snr,
             "truth": sorted(truth),
             "verdict": report.verdict,
             "said": [[f.location, f.effect] for f in report.findings],
-            "sensor": faults == channels,
+            "sensor": faults == wrong.channels,
             "physics": physics == truth,
             "blamed": bool({place for place, _ in physics} - {place for place, _ in truth}),
             "cpu_seconds": round(time.process_time() - began, 1),
@@ -150,18 +141,18 @@ def run(count: int = 60, seed: int = 1, first: int = 0) -> Iterator[dict[str, An
     }
 
 
-def falsified(system: System, clean: Array, kind: str, random: np.random.Generator) -> tuple[Array, set[str]]:
-    """Columns with an error of a kind, and the channels that have it."""
+def falsified(system: System, clean: Array, kind: str, random: np.random.Generator) -> FalsifiedRecording:
+    """A recording with an error of a kind."""
     values, names = clean.copy(), [channel.name for channel in system.channels]
     if kind == CLOCK:
         body = str(random.choice(list(system.bodies)))
-        node = [n for n, s in system.file.sensors.items() if isinstance(s, MotionSensor) and s.body == body]
+        node = sensors_on(system, body)
         at = [names.index(name) for name in node]
         values[:, at] = later(clean[:, at], float(random.choice([-1, 1]) * random.uniform(3e-5, 1.5e-4)))
-        return values, set(node)
+        return FalsifiedRecording(kind, frozenset(node), values)
     name, source = (str(one) for one in random.choice(list(system.sensors), 2, replace=False))
     values[:, names.index(name)] = ERRORS[kind](clean[:, names.index(name)], clean[:, names.index(source)], random)
-    return values, {name}
+    return FalsifiedRecording(kind, frozenset([name]), values)
 
 
 def later(series: Array, rate: float) -> Array:

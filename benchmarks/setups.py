@@ -92,12 +92,17 @@ def in_order(system: System, values: Array) -> Array:
     return values[:, [made.index(channel.name) for channel in system.channels]]
 
 
+def sensors_on(system: System, body: str) -> list[str]:
+    """Names of the sensors of a body's motion."""
+    return [n for n, s in system.file.sensors.items() if isinstance(s, MotionSensor) and s.body == body]
+
+
 def falsified(system: System, clean: Array, kind: str, random: np.random.Generator) -> FalsifiedRecording:
     """One wrong set-up of a kind."""
     values = clean.copy()
     names = [channel.name for channel in system.channels]
     sensors, body = list(system.sensors), str(random.choice(list(system.bodies)))
-    node = [n for n, s in system.file.sensors.items() if isinstance(s, MotionSensor) and s.body == body]
+    node = sensors_on(system, body)
     bogie = str(random.choice([b for b in system.bodies if b != "car"]))
     wheels = [e.lower for e in system.file.elements.values() if e.upper == bogie]
     if kind in ("element at another body", "position of an element"):

@@ -13,9 +13,9 @@ from sprung.model.system import load_system
 def test_an_error_changes_the_channels_it_names_and_no_others(kind: str) -> None:
     system, random = load_system(), np.random.default_rng(3)
     clean = np.cumsum(random.standard_normal((1000, len(system.channels))), axis=0)
-    wrong, channels = falsified(system, clean, kind, random)
-    changed = {channel.name for i, channel in enumerate(system.channels) if np.any(wrong[:, i] != clean[:, i])}
-    assert changed == channels and len(channels) == (4 if kind == CLOCK else 1)
+    wrong = falsified(system, clean, kind, random)
+    changed = {channel.name for i, channel in enumerate(system.channels) if np.any(wrong.values[:, i] != clean[:, i])}
+    assert changed == wrong.channels and len(wrong.channels) == (4 if kind == CLOCK else 1)
 
 
 def test_a_clock_is_right_in_the_middle_and_late_at_the_end() -> None:

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import resample
 
-from sprung.model.diagnosis.fit.baseline import refreshed, settled
+from sprung.model.diagnosis.fit.baseline import settled
 from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.investigation.configuration.hypotheses import Wiring
-from sprung.model.diagnosis.investigation.measurements.floor import is_unexplained
+from sprung.model.diagnosis.investigation.measurements.floor import is_unexplained, with_noise_anew
 from sprung.model.diagnosis.investigation.state import ClockDrift, Investigation
 from sprung.model.diagnosis.record.signals import Signals, drifting, transform
 from sprung.model.diagnosis.screening.screen import screen
@@ -58,14 +58,11 @@ def without_clock_drift(state: Investigation) -> Investigation | None:
             break
     if state.fit.chi_square - right.fit.chi_square < rival:
         return None
-    problem, fit = refreshed(right.problem, right.fit)
+    right = with_noise_anew(right)
     name = "|".join(state.signals.sensor_names[i] for i in late.sensors)
     return replace(
         right,
-        problem=problem,
-        fit=fit,
-        last=screen(problem, fit, state.system.catalogue, state.options.project),
-        held=replace(right.held, noise=problem.noise),
+        last=screen(right.problem, right.fit, state.system.catalogue, state.options.project),
         clock_drifts=(*state.clock_drifts, ClockDrift(name, rate, late.std)),
     )
 

@@ -15,12 +15,16 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from sprung.model.diagnosis.fit.baseline import refreshed, settled
+from sprung.model.diagnosis.fit.baseline import settled
 from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.investigation.configuration.effects import SENSOR_POSITION
 from sprung.model.diagnosis.investigation.configuration.fitted import SetupFault
 from sprung.model.diagnosis.investigation.measurements.error_form import form_of
-from sprung.model.diagnosis.investigation.measurements.floor import is_unexplained, leaves_more_than_noise
+from sprung.model.diagnosis.investigation.measurements.floor import (
+    is_unexplained,
+    leaves_more_than_noise,
+    with_noise_anew,
+)
 from sprung.model.diagnosis.investigation.state import Contradiction, Investigation
 from sprung.model.diagnosis.record.signals import drifting, transform
 from sprung.model.diagnosis.screening.screen import screen
@@ -46,7 +50,7 @@ def without_contradicted(state: Investigation) -> Investigation | None:
         # left-out sensors differ in their own noise, too, of twice as many degrees of freedom as bins
         by_chance = np.sqrt(8 * len(rest.problem.part.grid.omega[rest.problem.part.grid.band])) * rest.fit.reduced
         clearly = second.fit.chi_square - rest.fit.chi_square > rules.isolated * by_chance
-        rest = _with_noise(rest)
+        rest = with_noise_anew(rest)
         others = [state.signals.sensor_names[i] for i in group if i != sensor]
         if clearly and not leaves_more_than_noise(rest, others):
             return replace(rest, contradictions=(*state.contradictions, _described(state, rest, sensor)))
@@ -63,7 +67,7 @@ def without_misplaced(state: Investigation) -> Investigation:
             continue
         sensor = state.signals.sensor_names.index(fault.site.location)
         if any(sensor in members for members, _, _ in _groups(state)):
-            state = screened_anew(_with_noise(left_out(state, sensor)), state)
+            state = screened_anew(with_noise_anew(left_out(state, sensor)), state)
     return state
 
 
@@ -157,12 +161,6 @@ def left_out(state: Investigation, sensor: int) -> Investigation:
         held=replace(state.held, signals=signals, noise=noise),
         found=tuple(one for one in state.found if one.trial.term.location != name),
     )
-
-
-def _with_noise(state: Investigation) -> Investigation:
-    """An investigation with noise levels estimated anew, also for its held-out part."""
-    problem, fit = refreshed(state.problem, state.fit)
-    return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise))
 
 
 def screened_anew(state: Investigation, base: Investigation) -> Investigation:

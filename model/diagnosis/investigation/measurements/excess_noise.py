@@ -79,20 +79,19 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     through = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support[upper]) ** 2, variance).mean(axis=0)
     residual, measured = state.fit.spectrum[upper], state.problem.part.sensors[upper]
     power = np.minimum(np.mean(np.abs(residual) ** 2, axis=0), np.mean(np.abs(measured) ** 2, axis=0))
-    later, end = state.held.later, int(state.options.rules.noise.upper * state.held.later.grid.samples)
-    beyond = later.sensors[later.grid.band.stop : end]
-    if len(beyond) >= state.options.rules.noise.bins:
-        power = np.minimum(power, np.mean(np.abs(beyond) ** 2, axis=0))
-    found: np.ndarray = np.sqrt(np.maximum(power - through, 0.0)) / declared
+    found: np.ndarray = np.sqrt(np.maximum(np.minimum(power, later_power(state)) - through, 0.0)) / declared
     return found
 
 
 def later_power(state: Investigation) -> np.ndarray:
-    """Power of the sensors above the compared band in the held-out part, per sample, (S,): noise may begin in it."""
-    grid, upper = state.held.later.grid, state.options.rules.noise.upper
-    beyond = state.held.later.sensors[grid.band.stop : int(upper * grid.samples)]
-    few = len(beyond) < state.options.rules.noise.bins
-    return np.zeros(beyond.shape[1]) if few else np.asarray(np.mean(np.abs(beyond) ** 2, axis=0))
+    """Power of the sensors above the compared band in the held-out part, per sample, (S,): noise may begin in it.
+
+    Infinite where the part is too short to tell.
+    """
+    later, rules = state.held.later, state.options.rules.noise
+    beyond = later.sensors[later.grid.band.stop : int(rules.upper * later.grid.samples)]
+    few = len(beyond) < rules.bins
+    return np.full(beyond.shape[1], np.inf) if few else np.asarray(np.mean(np.abs(beyond) ** 2, axis=0))
 
 
 def outliers(

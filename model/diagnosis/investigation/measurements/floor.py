@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.misfit import misfit
 from sprung.model.diagnosis.investigation.measurements.excess_noise import later_power, upper_ratio
 from sprung.model.diagnosis.investigation.state import Investigation, NoiseFault
@@ -15,6 +16,12 @@ from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.signals import FloatArray
+
+
+def with_noise_anew(state: Investigation) -> Investigation:
+    """An investigation with noise levels estimated anew, also for its held-out part."""
+    problem, fit = refreshed(state.problem, state.fit)
+    return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise))
 
 
 def leaves_more_than_noise(state: Investigation, of: Sequence[str] | None = None) -> bool:
@@ -67,7 +74,8 @@ def bounded(state: Investigation, noisy: Sequence[NoiseFault] = ()) -> Noise:
     apart = {fault.location for fault in noisy}
     seen = np.where(_declares(state, apart), np.minimum(seen, rules.noise.misdeclared), seen) * known
     noise, slack = state.problem.noise, rules.verdict.slack
-    began = np.where([name in apart for name in state.signals.sensor_names], np.sqrt(later_power(state)), 0.0)
+    noisier, later = np.array([name in apart for name in state.signals.sensor_names]), np.sqrt(later_power(state))
+    began = np.where(noisier & np.isfinite(later), later, 0.0)
     sensors = bounded_noise(np.maximum(noise.sensors, began), known, np.maximum(seen, began), slack)
     force = bounded_noise(noise.force, declared.force, np.zeros(len(noise.force)), slack)
     return replace(noise, sensors=sensors, force=force)
